@@ -1,0 +1,98 @@
+"""What flows between the modules. Letters: V garment vertices, B body vertices, J joints, S betas, F faces,
+H hinges, E directed edges, T frames, L latent size, K blend shapes. SI units, +Y up."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+Array = jax.Array | np.ndarray
+
+
+class Body(NamedTuple):
+    """A rigged, shapeable body in its canonical (zero) pose."""
+
+    vertices: Array  # [B, 3] m
+    faces: Array  # [Fb, 3] int32
+    joints: Array  # [J, 3] m
+    parents: Array  # [J] int32, root -1, topological order
+    weights: Array  # [B, J] skinning weights, rows sum to 1
+    shapedirs: Array  # [B, 3, S] m per standard deviation
+    joint_shapedirs: Array  # [J, 3, S] m per standard deviation
+    posedirs: Array | None = None  # [B, 3, 9 (J - 1)] m, SMPL's pose blend shapes
+
+
+class Garment(NamedTuple):
+    """A garment aligned with its body's canonical pose, with the body's skinning and shape data diffused onto it."""
+
+    vertices: Array  # [V, 3] m
+    faces: Array  # [F, 3] int32
+    weights: Array  # [V, J] skinning weights, rows sum to 1
+    shapedirs: Array  # [V, 3, S] m per standard deviation
+    pinned: Array  # [V] bool, vertices that follow skinning
+
+
+class Motion(NamedTuple):
+    """A clip on a body's own joints; the identity rotation is the body's canonical pose."""
+
+    rotations: Array  # [T, J, 3, 3] local to the parent
+    translation: Array  # [T, 3] m, of the root relative to its canonical place
+    fps: float
+
+
+class Pose(NamedTuple):
+    """One frame of a motion."""
+
+    rotations: Array  # [J, 3, 3] local to the parent
+    translation: Array  # [3] m
+
+
+class Material(NamedTuple):
+    """Constants of the cloth; every field is a scalar."""
+
+    density: Array  # kg/m^2
+    mu: Array  # Pa, Lame's second parameter
+    lam: Array  # Pa, Lame's first parameter
+    bending: Array  # N m
+
+
+class Mesh(NamedTuple):
+    """Connectivity of a garment."""
+
+    faces: Array  # [F, 3] int32
+    hinges: Array  # [H, 4] int32: edge (a, b), then the vertex opposite it in the left and the right face
+
+
+class Rest(NamedTuple):
+    """Rest measures of a shaped garment, from its canonical vertices."""
+
+    inverse: Array  # [F, 2, 2] inverse of the rest edge matrix, 1/m
+    face_area: Array  # [F] m^2
+    hinge_area: Array  # [H] m^2, of the two faces together
+    hinge_angle: Array  # [H] rad
+    vertex_area: Array  # [V] m^2, a third of the incident faces
+
+
+class Contact(NamedTuple):
+    """The body surface each garment vertex may touch, frozen for one time step: a point and its normal."""
+
+    point: Array  # [V, 3] m, at the current frame
+    point_next: Array  # [V, 3] m, the same surface point at the next frame
+    normal: Array  # [V, 3] at the current frame
+    normal_next: Array  # [V, 3] at the next frame
+    index: Array  # [V] int32 of the surface point
+
+
+class ClothState(NamedTuple):
+    """A garment in motion. Positions are relative to the root's translation at the current frame."""
+
+    position: Array  # [V, 3] m
+    previous: Array  # [V, 3] m, one frame earlier
+    latent: Array  # [L] the code that produced `position`
+
+
+class EdgeSet(NamedTuple):
+    """Directed edges of one kind, sorted by receiver."""
+
+    senders: Array  # [E] int32
+    receivers: Array  # [E] int32
