@@ -1,0 +1,270 @@
+"""The reference solver: a time step of the cloth as the minimum of exactly the potential that training minimises.
+
+Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how far a
+network is from the optimum; it is never used to train.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from clothjax import losses, physics
+from clothjax.config import PhysicsConfig
+from clothjax.losses import TimeStep
+from clothjax.types import Array, Mesh
+
+VERTEX_TERMS = ("gravity", "inertia", "friction", "collision")
+CG_ITERATIONS = 600
+SHORTEST_STEP = 1e-8
+
+
+class Structure(NamedTuple):
+    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and where element blocks are added to it."""
+
+    indptr: np.ndarray  # [V + 1] int32
+    indices: np.ndarray  # [N] int32, column of each block
+    diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
+    target: (
+        np.ndarray
+    )  # [9 F + 16 H + V] int32, block of every pair of corners of every face, hinge and vertex
+
+
+class SolverInfo(NamedTuple):
+    """How a solve ended."""
+
+    converged: bool
+    iterations: int
+    gradient_norm: float  # N, of the free vertices
+    relative_gradient: float  # gradient_norm over the norm of the free vertices' weights
+    energy: float  # J
+
+
+def structure(mesh: Mesh, vertex_count: int) -> Structure:
+    """The sparsity pattern of the Hessian of a garment with `vertex_count` vertices."""
+    rows, columns = [], []
+    for corners in (np.asarray(mesh.faces), np.asarray(mesh.hinges), np.arange(vertex_count)[:, None]):
+        pairs = (*corners.shape, corners.shape[1])
+        rows.append(np.broadcast_to(corners[:, :, None], pairs).reshape(-1))
+        columns.append(np.broadcast_to(corners[:, None, :], pairs).reshape(-1))
+    key = np.concatenate(rows).astype(np.int64) * vertex_count + np.concatenate(columns)
+    blocks, target = np.unique(key, return_inverse=True)
+    row, column = blocks // vertex_count, blocks % vertex_count
+    indptr = np.searchsorted(row, np.arange(vertex_count + 1))
+    diagonal = np.flatnonzero(row == column)
+    return Structure(*(a.astype(np.int32) for a in (indptr, column, diagonal, target.reshape(-1))))
+
+
+def solve_step(
+    new0: Array,
+    step: TimeStep,
+    mesh: Mesh,
+    pinned: Array,
+    config: PhysicsConfig,
+    *,
+    tolerance: float = 1e-3,
+    max_iterations: int = 200,
+) -> tuple[np.ndarray, SolverInfo]:
+    """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
+
+    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned by the
+    3 x 3 diagonal blocks of a positive semidefinite one (`gauss_newton`), then a line search. The minimum is a
+    local one: folds have many. Contact planes and the friction mask are those of `step`, so the potential is smooth.
+
+    Args:
+        new0: [V, 3] m, where to start; pinned vertices stay there.
+        step: the time step; taken to float64.
+        mesh: faces and hinges.
+        pinned: [V] bool.
+        config: constants of contact and friction.
+        tolerance: the norm of the remaining force on the free vertices at which to stop, as a fraction of the norm
+            of their weights. It does not depend on the start, which a penetration can make as bad as one likes.
+        max_iterations: Newton iterations.
+
+    Returns:
+        Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met.
+
+    Raises:
+        ValueError: an input position that is not finite.
+    """
+    x = np.array(new0, np.float64)
+    if not np.isfinite(x).all():
+        raise ValueError(
+            f"solve_step: new0 has values that are not finite, first at vertex {int(np.argwhere(~np.isfinite(x))[0, 0])}"
+        )
+    step = jax.tree.map(_to_float64, step)
+    mesh = Mesh(np.asarray(mesh.faces), np.asarray(mesh.hinges))
+    pattern = structure(mesh, len(x))
+    free = np.broadcast_to(~np.asarray(pinned, bool)[:, None], x.shape)
+    weight = max(float(np.linalg.norm(physics.GRAVITY * step.mass[free[:, 0]])), np.finfo(np.float64).tiny)
+
+    with jax.enable_x64(True):
+        evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config)
+        hessian = partial(hessians, step=step, mesh=mesh, pattern=pattern, config=config)
+        energy, gradient = _host(evaluate(x), free)
+        iterations = 0
+        while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
+            exact, semidefinite = hessian(x)
+            forcing = min(0.1, np.sqrt(np.linalg.norm(gradient) / weight * 1e-1))
+            direction = _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing)
+            iterations += 1
+            x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
+            if not moved:
+                break
+    norm = float(np.linalg.norm(gradient))
+    return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy)
+
+
+@partial(jax.jit, static_argnames="config")
+def hessians(
+    x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig
+) -> tuple[Array, Array]:
+    """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
+
+    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the square of
+    the residual's gradient (Gauss-Newton); of the terms of single vertices, the positive eigenvalues.
+    """
+    rest, material = step.rest, step.material
+    corners, hinges = x[mesh.faces], x[mesh.hinges]
+
+    def face_energy(points, inverse, area):
+        return physics.stretching(points[None], inverse[None], area[None], material.mu, material.lam)[0]
+
+    def hinge_energy(points, area, angle):
+        return physics.bending(points[None], area[None], angle[None], material.bending)[0]
+
+    def vertex_gradient(new):
+        return jax.grad(
+            lambda y: sum(jnp.sum(losses.elements(y, step, mesh, config)[name]) for name in VERTEX_TERMS)
+        )(new)
+
+    # every vertex term depends on one vertex only, so three directions give all 3 x 3 blocks
+    axes = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, :], (3, *x.shape))
+    columns = jax.vmap(lambda axis: jax.jvp(vertex_gradient, (x,), (axis,))[1])(axes)
+    vertex = jnp.moveaxis(columns, 0, -1)
+    values, vectors = jnp.linalg.eigh(vertex)
+    positive = jnp.einsum("vab,vb,vcb->vac", vectors, jnp.maximum(values, 0.0), vectors)
+
+    exact = (
+        jax.vmap(jax.hessian(face_energy))(corners, rest.inverse, rest.face_area),
+        jax.vmap(jax.hessian(hinge_energy))(hinges, rest.hinge_area, rest.hinge_angle),
+        vertex,
+    )
+    semidefinite = (
+        _stretching_semidefinite(corners, step),
+        _bending_semidefinite(hinges, step),
+        positive,
+    )
+    return _assemble(exact, pattern), _assemble(semidefinite, pattern)
+
+
+def _stretching_semidefinite(corners: Array, step: TimeStep) -> Array:
+    """[F, 3, 3, 3, 3] N/m, the Hessian of stretching with the second Piola-Kirchhoff stress clamped."""
+    inverse, mu, lam = step.rest.inverse, step.material.mu, step.material.lam
+    eye = jnp.eye(2, dtype=corners.dtype)
+    # F = sum_i x_i b_i^T
+    b = jnp.concatenate([inverse, -jnp.sum(inverse, axis=1, keepdims=True)], axis=1)
+    deformation = jnp.einsum("fia,fip->fap", corners, b)
+    strain = physics.green_strain(corners, inverse)
+    trace = strain[:, 0, 0] + strain[:, 1, 1]
+    stress = 2.0 * mu * strain + lam * trace[:, None, None] * eye[None]
+
+    mean = 0.5 * (stress[:, 0, 0] + stress[:, 1, 1])
+    spread = 0.5 * (stress[:, 0, 0] - stress[:, 1, 1])
+    radius = jnp.sqrt(spread * spread + stress[:, 0, 1] * stress[:, 0, 1]) + 1e-12 * mu
+    high, low = jnp.maximum(mean + radius, 0.0), jnp.maximum(mean - radius, 0.0)
+    # the isotropic function that clamps both principal values, as slope * stress + shift * I
+    slope = (high - low) / (2.0 * radius)
+    shift = high - slope * (mean + radius)
+    clamped = slope[:, None, None] * stress + shift[:, None, None] * eye[None]
+
+    half = 0.5 * jnp.einsum("fip,faq->fpqia", b, deformation)
+    change = half + jnp.swapaxes(half, 1, 2)  # of the strain, with every coordinate
+    trace_change = change[:, 0, 0] + change[:, 1, 1]
+    blocks = 2.0 * mu * jnp.einsum("fpqia,fpqjb->fiajb", change, change)
+    blocks = blocks + lam * jnp.einsum("fia,fjb->fiajb", trace_change, trace_change)
+    geometric = jnp.einsum("fip,fpq,fjq->fij", b, clamped, b)
+    blocks = blocks + jnp.einsum("fij,ab->fiajb", geometric, jnp.eye(3, dtype=corners.dtype))
+    return (step.rest.face_area * physics.THICKNESS)[:, None, None, None, None] * blocks
+
+
+def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
+    """[H, 4, 3, 4, 3] N/m, Gauss-Newton of bending: k / (4 A) r'^T r' with r = l (theta - theta_0)."""
+
+    def residual(points, rest_angle):
+        edge = points[1] - points[0]
+        squared = jnp.sum(edge * edge)
+        length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+        return jnp.where(squared > 0, length, 0.0) * (physics.dihedral_angle(points[None])[0] - rest_angle)
+
+    slope = jax.vmap(jax.grad(residual))(hinges, step.rest.hinge_angle)
+    stiffness = step.material.bending / (4.0 * step.rest.hinge_area)
+    return jnp.einsum("h,hia,hjb->hiajb", stiffness, slope, slope)
+
+
+def _assemble(elements: tuple[Array, Array, Array], pattern: Structure) -> Array:
+    face, hinge, vertex = elements
+    blocks = [jnp.swapaxes(element, 2, 3).reshape(-1, 3, 3) for element in (face, hinge)]
+    return jax.ops.segment_sum(
+        jnp.concatenate([*blocks, vertex]), pattern.target, num_segments=pattern.indices.shape[0]
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def _value_and_gradient(x, step, mesh, config):
+    return jax.value_and_grad(losses.potential)(x, step, mesh, config)
+
+
+def _host(result, free) -> tuple[float, np.ndarray]:
+    energy, gradient = result
+    return float(energy), np.where(free, np.asarray(gradient), 0.0)
+
+
+def _to_float64(leaf: Array) -> np.ndarray:
+    leaf = np.asarray(leaf)
+    return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
+
+
+def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
+    """A descent direction [V, 3] m: the Newton step to a relative residual `forcing`, or up to negative curvature."""
+    # with D = L L^T the diagonal blocks, solve (L^-1 H L^-T) y = -L^-1 g: no preconditioner inside the loop
+    root = np.linalg.inv(np.linalg.cholesky(np.asarray(semidefinite)[pattern.diagonal]))
+    rows = np.repeat(np.arange(len(root)), np.diff(pattern.indptr))
+    exact = np.asarray(exact) * (free[rows, :1] & free[pattern.indices, :1])[:, :, None]
+    scaled = root[rows] @ exact @ root[pattern.indices].transpose(0, 2, 1)
+    matrix = scipy.sparse.bsr_array((scaled, pattern.indices, pattern.indptr))
+    residual = -(root @ gradient[:, :, None]).reshape(-1)
+    solution, search = np.zeros_like(residual), residual.copy()
+    squared = residual @ residual
+    limit = forcing**2 * squared
+    for iteration in range(CG_ITERATIONS):
+        product = matrix @ search
+        curvature = search @ product
+        if curvature <= 0:
+            if iteration == 0:
+                solution = search
+            break
+        length = squared / curvature
+        solution += length * search
+        residual -= length * product
+        previous, squared = squared, residual @ residual
+        if squared < limit:
+            break
+        search = residual + (squared / previous) * search
+    return (root.transpose(0, 2, 1) @ solution.reshape(-1, 3, 1))[:, :, 0]
+
+
+def _line_search(evaluate, x, energy, gradient, direction, free):
+    """Backtracking (Armijo) from x; the last result is whether a point with less energy was found."""
+    slope = float(np.sum(gradient * direction))
+    length = 1.0
+    while length >= SHORTEST_STEP:
+        trial = x + length * direction
+        trial_energy, trial_gradient = _host(evaluate(trial), free)
+        if trial_energy <= energy + 1e-4 * length * slope:
+            return trial, trial_energy, trial_gradient, True
+        length *= 0.5
+    return x, energy, gradient, False
