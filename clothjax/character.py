@@ -1,0 +1,88 @@
+"""A wearer: one body shape and one cloth in a scene, and how it stands at a frame."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax import contact, physics, rotation, skinning
+from clothjax.config import PhysicsConfig
+from clothjax.scene import Scene
+from clothjax.types import Array, Material, Pose, Rest
+
+
+class Character(NamedTuple):
+    """What betas and material decide."""
+
+    template: Array  # [V, 3] m, the shaped garment in the canonical pose
+    body: Array  # [B, 3] m, the shaped body within reach
+    joints: Array  # [J, 3] m
+    rest: Rest
+    mass: Array  # [V] kg
+    material: Material
+    betas: Array  # [S]
+
+
+class Frame(NamedTuple):
+    """A character at one frame. Positions are relative to the root's translation at the current frame."""
+
+    garment: Array  # [V, 3, 4] skinning transforms of the garment's vertices
+    body: Array  # [B, 3] m
+    normals: Array  # [B, 3]
+    surface: tuple[Array, Array]  # points [P, 3] m and normals [P, 3] that collide
+    root: Array  # [3] m, the root joint
+    heading: Array  # [3, 3] of the root, about +Y
+
+
+class Window(NamedTuple):
+    """Three frames around a time step."""
+
+    previous: Frame
+    current: Frame
+    following: Frame
+
+
+def dress(scene: Scene, betas: Array, material: Material, config: PhysicsConfig) -> Character:
+    """The character of shape `betas` [S] wearing cloth of `material`."""
+    template = skinning.shaped_vertices(scene.garment, betas)
+    measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
+    rest = physics.rest_measures(measured, scene.mesh, flat=config.flat_hinges)
+    return Character(
+        template=template,
+        body=skinning.shaped_vertices(scene.body, betas),
+        joints=skinning.shaped_joints(scene.body, betas),
+        rest=rest,
+        mass=rest.vertex_area * material.density,
+        material=material,
+        betas=betas,
+    )
+
+
+def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig) -> Frame:
+    """The character at a pose whose translation [3] m is relative to the root's at the current frame."""
+    transforms = skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents)
+    transforms = transforms.at[:, :, 3].add(pose.translation[None])
+    body = skinning.apply(skinning.blend(scene.body.weights, transforms), skinning.pose_corrected(scene.body, character.body, pose))
+    normals = skinning.vertex_normals(body, scene.body.faces)
+    vertices_collide = config.contact_surface == "vertices"
+    root = int(np.flatnonzero(np.asarray(scene.body.parents) < 0)[0])
+    return Frame(
+        garment=skinning.blend(scene.garment.weights, transforms),
+        body=body,
+        normals=normals,
+        surface=(body, normals) if vertices_collide else contact.surface(body, scene.body.faces, "faces"),
+        root=character.joints[root] + pose.translation,
+        heading=rotation.heading(pose.rotations[root]),
+    )
+
+
+def window(scene: Scene, character: Character, poses: Pose, config: PhysicsConfig) -> Window:
+    """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
+    return Window(
+        *(frame(scene, character, Pose(poses.rotations[i], poses.translation[i]), config) for i in range(3))
+    )
+
+
+def skinned(character: Character, frame: Frame) -> Array:
+    """The garment [V, 3] m by skinning alone."""
+    return skinning.apply(frame.garment, character.template)

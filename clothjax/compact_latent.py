@@ -1,0 +1,154 @@
+"""Phi: Encode, Process, Convolve, Decode (18). From a garment's state to the latent code of its next frame."""
+
+import jax
+import jax.numpy as jnp
+
+from clothjax import features as feature
+from clothjax import garment_model, graph_network, mesh_convolution
+from clothjax.character import Character, Window
+from clothjax.config import MaterialConfig, ModelConfig
+from clothjax.features import Features, Statistics
+from clothjax.graph_network import Params, dense, init_dense, init_mlp, mlp
+from clothjax.scene import Scene
+from clothjax.types import Array, ClothState, Contact
+
+TYPE_EMBEDDING, LEVEL_EMBEDDING = 9, 4
+
+
+def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
+    """Vertices left by the convolution and channels of each, so that their product L is nearest to config.latent."""
+    left = scene.tables[-1].ids.shape[0] if scene.tables else scene.garment.vertices.shape[0]
+    return left, max(1, round(config.latent / left))
+
+
+def init(key: Array, scene: Scene, example: Features, basis: Array, config: ModelConfig) -> Params:
+    """Parameters of Phi for features like `example`; `basis` [K, V, 3] m starts the blend shapes."""
+    keys = jax.random.split(key, 8)
+    width = config.width
+    hidden = (width,) * config.mlp_layers
+    embedding = TYPE_EMBEDDING + LEVEL_EMBEDDING
+    encoder = {"nodes": init_mlp(keys[0], (example.nodes.shape[-1] + embedding, *hidden))}
+    encoder["world"] = init_mlp(keys[1], (example.to_garment.shape[-1], *hidden))
+    for index, name in enumerate(sorted(example.edges)):
+        encoder[name] = init_mlp(jax.random.fold_in(keys[2], index), (example.edges[name].shape[-1], *hidden))
+    convolution, channels = [], width
+    for index, (level, table) in enumerate(zip(config.convolution, scene.tables)):
+        subkey = jax.random.fold_in(keys[3], index)
+        convolution.append(
+            mesh_convolution.init(subkey, table, channels, level.features, config.convolution_bases)
+        )
+        channels = level.features
+    left, per_vertex = latent_size(scene, config)
+    return {
+        "type_embedding": jax.random.normal(keys[4], (4, TYPE_EMBEDDING)),
+        "level_embedding": jax.random.normal(keys[5], (8, LEVEL_EMBEDDING)),
+        "encoder": encoder,
+        "processor": graph_network.init_processor(keys[6], config.processor, width, config.mlp_layers),
+        "convolution": convolution,
+        "latent": init_dense(keys[7], channels, per_vertex, gain=1.0),
+        "garment": garment_model.init(jax.random.fold_in(key, 9), left * per_vertex, basis, config),
+    }
+
+
+def init_statistics(example: Features) -> dict[str, Statistics]:
+    """Empty statistics for features like `example`."""
+    columns = {"nodes": example.nodes, "mesh": next(iter(example.edges.values())), "world": example.to_garment}
+    return {name: feature.empty_statistics(rows.shape[-1]) for name, rows in columns.items()}
+
+
+def observe(statistics: dict[str, Statistics], seen: Features, limit: int) -> dict[str, Statistics]:
+    """Statistics that have also seen a batch of features with leading axes [...]; body nodes count as nodes."""
+
+    def rows(*parts):
+        return jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
+
+    return {
+        "nodes": feature.observe(statistics["nodes"], rows(seen.nodes, seen.body), limit),
+        "mesh": feature.observe(statistics["mesh"], rows(*seen.edges.values()), limit),
+        "world": feature.observe(statistics["world"], rows(seen.to_garment, seen.to_body), limit),
+    }
+
+
+def encode(
+    params: Params,
+    statistics: dict[str, Statistics],
+    scene: Scene,
+    seen: Features,
+    latent: Array,
+    config: ModelConfig,
+) -> Array:
+    """Encode, Process, Convolve: the latent code [L] of the next frame from features and the current code [L]."""
+    encoder = params["encoder"]
+    pinned = scene.garment.pinned.astype(jnp.int32)
+    kinds = params["type_embedding"]
+
+    def nodes(rows, kind, level):
+        embedded = jnp.concatenate([kinds[kind], params["level_embedding"][level]], axis=-1)
+        return mlp(encoder["nodes"], jnp.concatenate([rows, embedded], axis=-1))
+
+    rows = feature.normalise(statistics["nodes"], seen.nodes)
+    garment = nodes(rows, 3 * pinned, jnp.asarray(scene.level))
+    ones = jnp.ones_like(pinned)
+    body = nodes(feature.normalise(statistics["nodes"], seen.body), ones, 0 * ones)
+    edges = {name: mlp(encoder[name], feature.normalise(statistics["mesh"], e)) for name, e in seen.edges.items()}
+    world = {"to_garment": mlp(encoder["world"], feature.normalise(statistics["world"], seen.to_garment))}
+    updated = config.body_nodes == "updated"
+    if updated:
+        world["to_body"] = mlp(encoder["world"], feature.normalise(statistics["world"], seen.to_body))
+    processed = graph_network.process(
+        params["processor"],
+        config.processor,
+        garment,
+        body,
+        edges,
+        world,
+        scene.graph,
+        seen.slots,
+        _active(scene, seen, config),
+        update_body=updated,
+        remat=config.remat,
+    )
+    for block, table in zip(params["convolution"], scene.tables):
+        processed = mesh_convolution.apply(
+            block, processed, table.ids, table.mask, residual_rate=config.residual_rate, activation=jax.nn.relu
+        )
+    code = dense(params["latent"], processed).reshape(-1)
+    return latent + code if config.latent_update == "residual" else code
+
+
+def step(
+    params: Params,
+    statistics: dict[str, Statistics],
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    window: Window,
+    contact: Contact,
+    nearest_vertex: Array,
+    timestep: Array,
+    model: ModelConfig,
+    material: MaterialConfig,
+) -> tuple[Array, Array, Features]:
+    """One step of Phi: the next positions [V, 3] m (relative to the current root), its latent code [L], its inputs."""
+    seen = feature.features(
+        scene, character, state, window, contact, nearest_vertex, timestep, model, material
+    )
+    latent = encode(params, statistics, scene, seen, state.latent, model)
+    return decode(params, scene, character, latent, window, model), latent, seen
+
+
+def decode(params: Params, scene: Scene, character: Character, latent: Array, window: Window, model: ModelConfig):
+    """The next frame's vertices [V, 3] m of a latent code [L]."""
+    free = 1.0 - jnp.asarray(scene.garment.pinned).astype(latent.dtype)
+    displaced = garment_model.displacement(params["garment"], latent, free, model)
+    return garment_model.vertices(displaced, character.template, window.following.garment)
+
+
+def _active(scene: Scene, seen: Features, config: ModelConfig) -> dict[str, Array]:
+    """Which pairs pass messages in each stack: all where the fine mesh does, else those at its coarse vertices."""
+    active = {}
+    for index, stack in enumerate(config.processor):
+        coarse = [int(name.removeprefix("coarse")) for name in stack.edges if name != "mesh"]
+        lowest = 0 if "mesh" in stack.edges else 1 + min(coarse)
+        active[str(index)] = seen.active & jnp.asarray(scene.level >= lowest)
+    return active

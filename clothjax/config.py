@@ -1,0 +1,233 @@
+"""Every setting of an experiment, with its unit and default, as frozen dataclasses."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a material constant is drawn from in training, and how the networks see it: scaled to [0, 1]."""
+
+    low: float
+    high: float
+    log: bool = False
+    """Uniform in the logarithm."""
+
+    def __post_init__(self):
+        _require(0 < self.low <= self.high, f"need 0 < low <= high, got low {self.low}, high {self.high}")
+
+
+@dataclass(frozen=True)
+class MaterialConfig:
+    """The cloth. `ranges` are trained over (the thesis's), the single values are what evaluation uses (HOOD's)."""
+
+    density: float = 0.20022  # kg/m^2
+    mu: float = 23600.0  # Pa
+    lam: float = 44400.0  # Pa
+    bending: float = 3.9625778e-5  # N m
+    density_range: Range = Range(4.34e-2, 7e-1)
+    mu_range: Range = Range(15909.0, 63636.0, log=True)
+    lam_range: Range = Range(3535.41, 93333.73)
+    bending_range: Range = Range(6.37e-8, 1.31e-3, log=True)
+    sample: bool = True
+    """Draw materials from the ranges in training; false keeps the single values."""
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    """Constants of the energies that do not belong to the cloth."""
+
+    collision_stiffness: float = 1e5  # J/m^3, of the cubic penetration
+    collision_offset: float = 3e-3  # m
+    friction_coefficient: float = 0.5
+    friction_radius: float = 3e-3  # m, a distance (HOOD compares its square with this)
+    friction_smoothing: float = 1e-4  # m
+    flat_hinges: bool = True
+    """Bending is measured from flat, as in HOOD; false: from the canonical angle."""
+    shaped_rest: bool = True
+    """The rest shape follows the wearer's betas (a graded garment); false: always the template, as in HOOD."""
+    contact_surface: Literal["vertices", "faces"] = "vertices"
+    """The body's tangent planes: at its nearest vertex, or at its nearest face centroid, as in HOOD."""
+    reach: float = 0.45  # m, body farther than this from the garment at rest is never searched
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A loss weight relative to the physical one: constant, or linear between two training steps."""
+
+    start: float = 1.0
+    end: float | None = None
+    first_step: int = 0
+    last_step: int = 0
+
+    def __post_init__(self):
+        _require(self.start >= 0 and (self.end is None or self.end >= 0), "loss weights must be >= 0")
+        _require(self.end is None or self.last_step > self.first_step, "a ramp needs last_step > first_step")
+
+    @property
+    def absent(self) -> bool:
+        """Whether the term is never there, so that it can be left out of the program."""
+        return self.start == 0 and not self.end
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of (20)."""
+
+    stretching: Ramp = Ramp()
+    bending: Ramp = Ramp()
+    gravity: Ramp = Ramp()
+    inertia: Ramp = Ramp()
+    friction: Ramp = Ramp()
+    collision: Ramp = Ramp()
+    scale: float = 0.02  # J, the energy that counts as a loss of 1
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Message-passing blocks in a row on the same edge sets: `mesh` and `coarse0`, `coarse1`, ..."""
+
+    edges: tuple[str, ...]
+    blocks: int
+
+
+@dataclass(frozen=True)
+class Level:
+    """One mesh-convolution block."""
+
+    features: int
+    stride: int = 2
+    radius: int = 2
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of Phi (Encode, Process, Convolve, Decode) and of the blend shapes."""
+
+    width: int = 48
+    mlp_layers: int = 2
+    """Linear layers of every encoder and processor MLP."""
+    processor: tuple[Stack, ...] = (Stack(("mesh", "coarse1"), 4),)
+    body_nodes: Literal["updated", "encoded"] = "encoded"
+    """Whether body nodes take part in message passing, or only send their encoding to the garment."""
+    body_radius: float = 0.03  # m, garment and body vertices closer than this are joined
+    canonical_features: bool = True
+    """Adds, to HOOD's features, the state seen from the canonical pose at the next frame."""
+    convolution: tuple[Level, ...] = (Level(64), Level(64))
+    convolution_bases: int = 8
+    residual_rate: float = 0.5
+    latent: int = 240
+    """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
+    latent_update: Literal["absolute", "residual"] = "residual"
+    """Whether the network gives Z, or its change from the current frame's."""
+    decoder: tuple[int, ...] = (256, 256)
+    """Hidden layers of the decoder, before the blend-shape weights."""
+    blendshapes: int = 128
+    blendshape_relu: bool = False
+    """A ReLU on the blend-shape weights, as in the thesis."""
+    normalizer_steps: int = 2000
+    """Training steps over which the feature statistics are collected; then they are frozen."""
+    remat: bool = False
+    """Recompute each message-passing block in the backward pass: several times less memory, a little slower."""
+
+    def __post_init__(self):
+        _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")
+        _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
+        known = {"mesh", "coarse0", "coarse1", "coarse2", "coarse3"}
+        for stack in self.processor:
+            unknown = set(stack.edges) - known
+            _require(not unknown, f"unknown edge sets {sorted(unknown)}; allowed: {sorted(known)}")
+
+
+@dataclass(frozen=True)
+class Stage1Config:
+    """Training of Phi on the physics."""
+
+    steps: int = 12000
+    batch: int = 1
+    """Simulations advanced in one update."""
+    pool: int = 48
+    """Persistent simulations; `restart_probability: 1` with any pool is HOOD's restart curriculum."""
+    restart_probability: float = 1.0 / 90.0
+    rollout: int = 1
+    """Frames of one update at the start ..."""
+    rollout_end: int = 1
+    """... and at the most."""
+    rollout_every: int = 5000
+    """Steps after which the rollout grows by one frame."""
+    start_timestep: float = 1.0 / 3.0  # s, of the quasi-static first step (HOOD); 0: start as skinned
+    learning_rate: float = 1e-3
+    decay_start: float = 0.4
+    """Fraction of the steps at full rate; then exponential decay ..."""
+    decay_end: float = 0.03
+    """... to this fraction of it."""
+    blendshape_rate: float = 0.1
+    """Learning rate of the blend shapes, relative."""
+    adam_b2: float = 0.99
+    clip: float = 1.0
+    ema: float = 0.995
+    """Decay per step of the averaged parameters that evaluation uses."""
+    betas: float = 2.0  # standard deviations, drawn uniformly from +-this
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Stage2Config:
+    """Training of the latent predictor on the frozen teacher (21)."""
+
+    steps: int = 6000
+    batch: int = 64
+    rollout: int = 8
+    """Frames predicted in a row in one update."""
+    noise: float = 0.3
+    """Standard deviation of the noise on Z_t, in standard deviations of Z."""
+    pushforward: bool = False
+    """Only the last frame of the rollout is trained, the others without gradient."""
+    hidden: tuple[int, ...] = (512, 512)
+    learning_rate: float = 1e-3
+    clip: float = 1.0
+    sequences: int = 64
+    """Teacher rollouts, each of its own betas and material ..."""
+    frames: int = 160
+    """... and this many frames."""
+    excluded_joints: tuple[str, ...] = ("Hand", "Finger", "Thumb", "Toe")
+    """Joints whose names contain one of these are not inputs."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What `experiments.evaluate` runs on when it is told nothing else."""
+
+    motions: tuple[str, ...] = ("walk_3",)
+    betas_seed: int = 12345
+    betas: float = 1.5  # standard deviations
+    gap_frames: int = 10
+    """Frames at which the reference solver is asked."""
+    long_frames: int = 1000
+    """Frames of the closed-loop test, the motion repeated."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """One experiment."""
+
+    garment: str = "tshirt_1000"
+    body: str = "body"
+    motions: tuple[str, ...] = ()
+    """Training motions: asset names or paths; empty: every embedded clip but those of `evaluation`."""
+    fps: float = 30.0
+    material: MaterialConfig = field(default_factory=MaterialConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    stage1: Stage1Config = field(default_factory=Stage1Config)
+    stage2: Stage2Config = field(default_factory=Stage2Config)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    directory: str = ""
+    """Where the run is kept; empty: runs/<name of the config file>."""

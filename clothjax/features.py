@@ -1,0 +1,224 @@
+"""Node and edge features of Phi, in the root's heading frame, and their running normalisation.
+
+Nothing here changes when the scene is moved, or turned about the vertical.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from clothjax import contact as contacts
+from clothjax import skinning
+from clothjax.character import Character, Window
+from clothjax.config import MaterialConfig, ModelConfig
+from clothjax.scene import Scene
+from clothjax.types import Array, ClothState, Contact, Material
+
+
+class Statistics(NamedTuple):
+    """Running mean and variance of a set of feature columns."""
+
+    mean: Array  # [N]
+    variance: Array  # [N]
+    count: Array  # batches seen
+
+
+class Features(NamedTuple):
+    """Raw inputs of the encoders."""
+
+    nodes: Array  # [V, N]
+    body: Array  # [V, N], one slot for each garment vertex at the most
+    edges: dict[str, Array]  # [E, M] by edge set
+    to_garment: Array  # [V, W] of the pair (garment vertex, its nearest body vertex)
+    to_body: Array  # [V, W] the same pair in the other direction
+    slots: Array  # [V] int32, the body slot of each garment vertex
+    active: Array  # [V] bool, whether the pair is close enough to count
+
+
+def features(
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    window: Window,
+    contact: Contact,
+    nearest_vertex: Array,
+    timestep: Array,
+    model: ModelConfig,
+    material: MaterialConfig,
+) -> Features:
+    """The inputs of Phi for one step: HOOD's, plus positions and accelerations (method: X_H+).
+
+    Args:
+        contact: planes at the garment's nearest body points, for the canonical features.
+        nearest_vertex: [V] int32, the body vertex nearest to each garment vertex now.
+        timestep: s.
+    """
+    current, following = window.current, window.following
+    turn = current.heading.T
+    count = scene.garment.vertices.shape[0]
+    inputs = material_inputs(character.material, material)
+
+    # body nodes: the distinct nearest vertices, in slots
+    vertices, slots = jnp.unique(nearest_vertex, size=count, fill_value=0, return_inverse=True)
+    slots = slots.astype(jnp.int32).reshape(-1)
+    body_now, body_next = current.body[vertices], following.body[vertices]
+    body_before = window.previous.body[vertices]
+
+    def node(velocity, acceleration, normal, position, log_mass, materials):
+        shared = [velocity, acceleration, normal, position - current.root[None]]
+        columns = [_rotate(turn, part) for part in shared]
+        return jnp.concatenate(
+            [*columns, _column(jnp.asarray(timestep), count), log_mass[:, None], materials], axis=-1
+        )
+
+    garment = node(
+        state.velocity,
+        state.acceleration,
+        skinning.vertex_normals(state.position, scene.mesh.faces),
+        state.position,
+        jnp.log(character.mass),
+        jnp.broadcast_to(inputs[None], (count, 3)),
+    )
+    body = node(
+        body_now - body_before,
+        body_next - 2 * body_now + body_before,
+        current.normals[vertices],
+        body_now,
+        -jnp.ones_like(character.mass),
+        -jnp.ones((count, 3), body_now.dtype),
+    )
+
+    edge_points = {"now": state.position}
+    if model.canonical_features:
+        extra, held, drifted = _canonical(character, state, window, contact)
+        garment = jnp.concatenate([garment, extra], axis=-1)
+        body = jnp.concatenate([body, jnp.zeros_like(extra)], axis=-1)
+        edge_points |= {"held": held, "drifted": drifted}
+    edges = {
+        name: _mesh_edges(senders, receivers, edge_points, character.template, turn, timestep, inputs)
+        for name, (senders, receivers) in scene.graph.items()
+    }
+
+    offset_now = state.position - current.body[nearest_vertex]
+    offset_next = state.position - following.body[nearest_vertex]
+    to_body, to_garment = (
+        jnp.concatenate(
+            [
+                _rotate(turn, sign * offset_now),
+                _length(offset_now),
+                _rotate(turn, sign * offset_next),
+                _length(offset_next),
+                _column(jnp.asarray(timestep), count),
+            ],
+            axis=-1,
+        )
+        for sign in (1.0, -1.0)
+    )
+    active = jnp.sum(offset_now * offset_now, axis=-1) <= model.body_radius**2
+    return Features(garment, body, edges, to_garment, to_body, slots, active)
+
+
+def material_inputs(material: Material, config: MaterialConfig) -> Array:
+    """Bending, mu and lambda [3] scaled to [0, 1] over their training ranges (HOOD's order)."""
+    pairs = (
+        (material.bending, config.bending_range),
+        (material.mu, config.mu_range),
+        (material.lam, config.lam_range),
+    )
+    return jnp.stack([scaled(value, limits) for value, limits in pairs])
+
+
+def scaled(value: Array, limits) -> Array:
+    """A material constant on [0, 1] over its training range, logarithmic where the range is."""
+    if limits.low == limits.high:
+        return jnp.zeros_like(jnp.asarray(value))
+    low, high = jnp.log(limits.low), jnp.log(limits.high)
+    if limits.log:
+        return ((jnp.log(value) - low) / (high - low)).astype(jnp.asarray(value).dtype)
+    return (value - limits.low) / (limits.high - limits.low)
+
+
+def _canonical(character: Character, state: ClothState, window: Window, contact: Contact):
+    """The state as the next frame's canonical pose sees it, [V, 19]; and where it would be if nothing pushed.
+
+    `held` keeps the canonical displacement, `drifted` keeps the velocity: the two guesses between which, roughly,
+    the next position lies. Contact is measured from both.
+    """
+    following = window.following.garment
+    displacement = skinning.unapply(window.current.garment, state.position) - character.template
+    held = skinning.apply(following, character.template + displacement)
+    drifted = state.position + state.velocity
+    down = jnp.zeros_like(drifted).at[:, 1].set(-1.0)
+    gap_held = contacts.distance(held, contact.point_next, contact.normal_next)
+    gap_drifted = contacts.distance(drifted, contact.point_next, contact.normal_next)
+    columns = [
+        displacement,
+        skinning.unapply(following, drifted) - character.template,
+        skinning.unapply_direction(following, down),
+        skinning.unapply_direction(following, contact.normal_next),
+        character.template,
+        jnp.clip(gap_held, -0.05, 0.05)[:, None],
+        jnp.clip(gap_drifted, -0.05, 0.05)[:, None],
+        jnp.maximum(0.003 - gap_held, 0.0)[:, None],
+        jnp.maximum(0.003 - gap_drifted, 0.0)[:, None],
+    ]
+    return jnp.concatenate(columns, axis=-1), held, drifted
+
+
+def _mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
+    """Relative positions now and at rest, and the strain of each guess of the next state."""
+    rest = template[senders] - template[receivers]
+    rest_length = _length(rest)
+    now = points["now"][senders] - points["now"][receivers]
+    columns = [_rotate(turn, now), _length(now), rest, rest_length]
+    for name in ("held", "drifted"):
+        if name in points:
+            vector = points[name][senders] - points[name][receivers]
+            columns += [_length(vector) / rest_length - 1.0]
+    columns += [_column(jnp.asarray(timestep), len(senders)), jnp.broadcast_to(inputs[None], (len(senders), 3))]
+    return jnp.concatenate(columns, axis=-1)
+
+
+# --- normalisation ------------------------------------------------------------------------------------------------
+
+
+def empty_statistics(columns: int) -> Statistics:
+    """Statistics of nothing yet: they leave features as they are."""
+    return Statistics(jnp.zeros(columns), jnp.ones(columns), jnp.zeros(()))
+
+
+def observe(statistics: Statistics, rows: Array, limit: int) -> Statistics:
+    """Statistics that have also seen `rows` [N, columns], unless `limit` batches are already in.
+
+    Chan's update of mean and variance: E[x^2] - E[x]^2 would lose constant columns to rounding.
+    """
+    mean, variance = jnp.mean(rows, axis=0), jnp.var(rows, axis=0)
+    share = 1.0 / (statistics.count + 1.0)
+    shift = mean - statistics.mean
+    merged = Statistics(
+        mean=statistics.mean + share * shift,
+        variance=(1.0 - share) * statistics.variance + share * variance + share * (1.0 - share) * shift * shift,
+        count=statistics.count + 1.0,
+    )
+    keep = statistics.count < limit
+    return Statistics(*(jnp.where(keep, new, old) for new, old in zip(merged, statistics)))
+
+
+def normalise(statistics: Statistics, rows: Array, bound: float = 10.0) -> Array:
+    """Features [N, columns] by mean and standard deviation, clipped to `bound` deviations."""
+    deviation = jnp.sqrt(jnp.maximum(statistics.variance, 1e-12))
+    return jnp.clip((rows - statistics.mean[None]) / deviation[None], -bound, bound)
+
+
+def _rotate(turn: Array, vectors: Array) -> Array:
+    return jnp.einsum("ab,nb->na", turn, vectors, precision="highest")
+
+
+def _length(vectors: Array) -> Array:
+    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
+    zero = squared == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def _column(scalar: Array, count: int) -> Array:
+    return jnp.broadcast_to(scalar.reshape(1, 1), (count, 1))

@@ -1,0 +1,41 @@
+"""From a latent code to vertices: decoder, learnable blend shapes, skinning (17)-(19). Shared by Phi and Psi."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from clothjax import skinning
+from clothjax.config import ModelConfig
+from clothjax.graph_network import Params, init_mlp, mlp
+from clothjax.types import Array
+
+
+def init(key: Array, latent: int, basis: Array, config: ModelConfig) -> Params:
+    """Parameters: a decoder whose last layer is near zero, and blend shapes [K, V, 3] m starting from `basis`.
+
+    A decoder of ordinary size would start the garment metres away: 4e4 J instead of a skinned garment's few.
+    """
+    sizes = (latent, *config.decoder, basis.shape[0])
+    return {
+        "decoder": init_mlp(key, sizes, norm=False, last_gain=4e-4),
+        "blendshapes": jnp.asarray(basis),
+    }
+
+
+def blend_weights(params: Params, latent: Array, config: ModelConfig) -> Array:
+    """Blend-shape weights [K] of a latent code [L]."""
+    weights = mlp(params["decoder"], latent)
+    return nn.relu(weights) if config.blendshape_relu else weights
+
+
+def displacement(params: Params, latent: Array, free: Array, config: ModelConfig) -> Array:
+    """Canonical displacement [V, 3] m of a latent code [L] (19); zero where `free` [V] is zero (pins)."""
+    weights = blend_weights(params, latent, config)
+    shapes = params["blendshapes"]
+    flat = jnp.matmul(weights, shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST)
+    return flat.reshape(shapes.shape[1:]) * free[:, None]
+
+
+def vertices(displaced: Array, template: Array, transforms: Array) -> Array:
+    """Garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4] (17)."""
+    return skinning.apply(transforms, template + displaced)

@@ -1,0 +1,92 @@
+"""The incremental potential of one time step: its terms, and their weighted sum (20)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from clothjax import contact as contacts
+from clothjax import physics
+from clothjax.config import LossConfig, PhysicsConfig, Ramp
+from clothjax.types import Array, Contact, Material, Mesh, Rest
+
+TERMS = ("stretching", "bending", "gravity", "inertia", "friction", "collision")
+
+
+class TimeStep(NamedTuple):
+    """Everything the incremental potential of a step depends on, but the new positions."""
+
+    position: Array  # [V, 3] m, now
+    velocity: Array  # [V, 3] m per step, so that position + velocity is the inertial prediction
+    mass: Array  # [V] kg
+    rest: Rest
+    material: Material
+    contact: Contact
+    touching: Array  # [V] bool, in contact now
+    timestep: Array  # s
+
+
+def touching(position: Array, contact: Contact, radius: float) -> Array:
+    """Whether each vertex [V, 3] m is within `radius` m of its contact plane."""
+    return contacts.distance(position, contact.point, contact.normal) < radius
+
+
+def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+    """Every term of the incremental potential at new positions [V, 3] m, element by element, in J.
+
+    The sums of these are what training minimises and what the reference solver minimises: there is no other energy.
+    """
+    moved = new - step.position
+    contact = step.contact
+    normal = contact.normal + contact.normal_next
+    length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
+    return {
+        "stretching": physics.stretching(
+            new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
+        ),
+        "bending": physics.bending(
+            new[mesh.hinges], step.rest.hinge_area, step.rest.hinge_angle, step.material.bending
+        ),
+        # the height gained in the step: the same force as the height, without its large constant
+        "gravity": physics.gravity(moved[:, 1], step.mass),
+        "inertia": physics.inertia(moved - step.velocity, step.mass, step.timestep),
+        "friction": physics.friction(
+            moved - (contact.point_next - contact.point),
+            normal / length,
+            step.mass,
+            step.touching,
+            config.friction_coefficient,
+            config.friction_smoothing,
+        ),
+        "collision": config.collision_stiffness
+        * physics.collision(
+            contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset
+        ),
+    }
+
+
+def energies(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+    """The terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
+    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config).items()}
+
+
+def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
+    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises (11)."""
+    return sum(energies(new, step, mesh, config).values())
+
+
+def weighted(terms: dict[str, Array], config: LossConfig, training_step: Array) -> Array:
+    """The training loss: the weighted sum of terms in J over `config.scale`; absent terms are not computed."""
+    total = sum(
+        weight(getattr(config, name), training_step) * terms[name]
+        for name in TERMS
+        if not getattr(config, name).absent
+    )
+    return total / config.scale
+
+
+def weight(ramp: Ramp, training_step: Array) -> Array | float:
+    """A loss weight at a training step."""
+    if ramp.end is None:
+        return ramp.start
+    done = (training_step - ramp.first_step) / (ramp.last_step - ramp.first_step)
+    return ramp.start + (ramp.end - ramp.start) * jnp.clip(done, 0.0, 1.0)

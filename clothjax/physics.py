@@ -1,0 +1,118 @@
+"""The energies of cloth, each from positions and constants: no weights, no networks.
+
+Elementwise functions return one value per face, hinge or vertex, so that the same code gives the loss (a sum),
+the force (its gradient) and the reference solver's Hessian (its second derivative, element by element).
+Every function is finite with a finite gradient at zero edges, zero areas, flat and folded hinges and zero slip.
+"""
+
+import jax.numpy as jnp
+
+from clothjax.types import Array, Mesh, Rest
+
+GRAVITY = 9.81  # m/s^2
+THICKNESS = 4.7e-4  # m, of the StVK membrane, HOOD and SNUG
+COLLISION_OFFSET = 3e-3  # m, the cloth is pushed out to this distance from the body
+FRICTION_RADIUS = 3e-3  # m, closer than this to the body a vertex is in contact
+
+
+def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:
+    """Rest measures of a garment from its canonical vertices [V, 3] m.
+
+    With `flat` the rest angle of every hinge is zero, as in HOOD; otherwise it is the canonical one.
+    """
+    corners = vertices[mesh.faces]
+    e0, e1 = corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]
+    normal = jnp.cross(e0, e1)
+    double_area = _norm(normal)
+    length = _norm(e0)
+    # the edge matrix in the basis (e0 / |e0|, in-plane normal to it) is upper triangular
+    along = jnp.sum(e0 * e1, axis=-1) / length
+    height = double_area / length
+    zero = jnp.zeros_like(length)
+    inverse = jnp.stack([1.0 / length, -along / (length * height), zero, 1.0 / height], axis=-1)
+    face_area = 0.5 * double_area
+    angle = dihedral_angle(vertices[mesh.hinges])
+    return Rest(
+        inverse=inverse.reshape(-1, 2, 2),
+        face_area=face_area,
+        hinge_area=_triangle_areas(vertices[mesh.hinges]),
+        hinge_angle=jnp.zeros_like(angle) if flat else angle,
+        vertex_area=jnp.zeros_like(vertices[:, 0]).at[mesh.faces.reshape(-1)].add(jnp.repeat(face_area / 3.0, 3)),
+    )
+
+
+def green_strain(corners: Array, inverse: Array) -> Array:
+    """Green strain [F, 2, 2] of posed triangles [F, 3, 3] m with inverse rest edge matrices [F, 2, 2]."""
+    edges = jnp.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=-1)
+    gradient = jnp.einsum("fab,fbc->fac", edges, inverse)
+    metric = jnp.einsum("fab,fac->fbc", gradient, gradient)
+    return 0.5 * (metric - jnp.eye(2, dtype=corners.dtype)[None])
+
+
+def stretching(corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=THICKNESS) -> Array:
+    """Saint Venant-Kirchhoff energy [F] J: A h (mu tr(G^2) + lambda/2 tr(G)^2) of triangles [F, 3, 3] m."""
+    strain = green_strain(corners, inverse)
+    trace = strain[:, 0, 0] + strain[:, 1, 1]
+    return area * thickness * (mu * jnp.sum(strain * strain, axis=(1, 2)) + 0.5 * lam * trace * trace)
+
+
+def dihedral_angle(corners: Array) -> Array:
+    """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 when flat, and where a face has no area."""
+    edge = corners[:, 1] - corners[:, 0]
+    left = jnp.cross(edge, corners[:, 2] - corners[:, 0])
+    right = jnp.cross(corners[:, 3] - corners[:, 0], edge)
+    sine = jnp.sum(jnp.cross(left, right) * edge, axis=-1)
+    cosine = jnp.sum(left * right, axis=-1) * _norm(edge)
+    degenerate = (sine == 0) & (cosine == 0)
+    return jnp.where(degenerate, 0.0, jnp.arctan2(sine, jnp.where(degenerate, 1.0, cosine)))
+
+
+def bending(corners: Array, area: Array, rest_angle: Array, stiffness: Array) -> Array:
+    """Dihedral energy [H] J: k l^2 / (4 A) (theta - theta_0)^2 / 2, with l the current edge, A the rest area."""
+    edge = corners[:, 1] - corners[:, 0]
+    angle = dihedral_angle(corners) - rest_angle
+    return stiffness * jnp.sum(edge * edge, axis=-1) / (8.0 * area) * angle * angle
+
+
+def gravity(height: Array, mass: Array) -> Array:
+    """Potential energy [V] J of masses [V] kg raised by `height` [V] m."""
+    return GRAVITY * mass * height
+
+
+def inertia(deviation: Array, mass: Array, timestep: Array) -> Array:
+    """Incremental kinetic potential [V] J (16): m |x - (x_t + v_t)|^2 / (2 dt^2), the deviation [V, 3] m given."""
+    return mass * jnp.sum(deviation * deviation, axis=-1) / (2.0 * timestep * timestep)
+
+
+def collision(distance: Array, offset=COLLISION_OFFSET) -> Array:
+    """Cubic penetration max(offset - d, 0)^3 [V] m^3 at signed distances [V] m; times a stiffness in J/m^3."""
+    depth = jnp.maximum(offset - distance, 0.0)
+    return depth * depth * depth
+
+
+def friction(slip: Array, normal: Array, mass: Array, touching: Array, coefficient=0.5, smoothing=1e-4) -> Array:
+    """HOOD's friction potential [V] J: c g m kappa |tau| where a vertex touches the body.
+
+    tau is the slip [V, 3] m relative to the body without its part along the contact normal [V, 3], and
+    kappa = sqrt(1 - cos^2(tau, up) + 1e-4) weakens it along gravity. |tau| is smoothed over `smoothing` m
+    (0 gives HOOD's value, with a zero gradient at zero slip).
+    """
+    tangential = slip - jnp.sum(slip * normal, axis=-1, keepdims=True) * normal
+    squared = jnp.sum(tangential * tangential, axis=-1)
+    still = squared + smoothing * smoothing == 0
+    length = jnp.sqrt(jnp.where(still, 1.0, squared + smoothing * smoothing))
+    up = tangential[:, 1] / length
+    kappa = jnp.sqrt(jnp.abs(1.0 - up * up) + 1e-4)
+    distance = jnp.where(still, 0.0, length - smoothing)
+    return jnp.where(touching, coefficient * GRAVITY * mass * kappa * distance, 0.0)
+
+
+def _norm(vector: Array) -> Array:
+    squared = jnp.sum(vector * vector, axis=-1)
+    zero = squared == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def _triangle_areas(hinges: Array) -> Array:
+    a, b, c, d = hinges[:, 0], hinges[:, 1], hinges[:, 2], hinges[:, 3]
+    return 0.5 * (_norm(jnp.cross(b - a, c - a)) + _norm(jnp.cross(b - a, d - a)))

@@ -1,0 +1,164 @@
+"""One simulated frame of Phi, and rollouts: a scan of frames with the losses accumulated inside."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from clothjax import character as characters
+from clothjax import clips as motion
+from clothjax import compact_latent, contact, losses
+from clothjax.character import Character, Window
+from clothjax.clips import Clips
+from clothjax.config import Config
+from clothjax.features import Features
+from clothjax.losses import TimeStep
+from clothjax.scene import Scene
+from clothjax.types import Array, ClothState, Pose
+
+
+class Taken(NamedTuple):
+    """A step that was taken, and what its potential was made of."""
+
+    new: Array  # [V, 3] m, relative to the root at the current frame
+    step: TimeStep
+    seen: Features
+
+
+def start(character: Character, window: Window, latent_size: int) -> ClothState:
+    """A garment as skinned at the current frame, moving with the body."""
+    now = characters.skinned(character, window.current)
+    return ClothState(
+        position=now,
+        velocity=now - characters.skinned(character, window.previous),
+        acceleration=jnp.zeros_like(now),
+        latent=jnp.zeros(latent_size, now.dtype),
+    )
+
+
+def time_step(
+    character: Character, state: ClothState, window: Window, timestep: Array, config: Config
+) -> tuple[TimeStep, contact.Contact]:
+    """The incremental potential's constants for the step from `window.current` to `window.following`."""
+    planes = contact.find(state.position, window.current.surface, window.following.surface)
+    step = TimeStep(
+        position=state.position,
+        velocity=state.velocity,
+        mass=character.mass,
+        rest=character.rest,
+        material=character.material,
+        contact=planes,
+        touching=losses.touching(state.position, planes, config.physics.friction_radius),
+        timestep=jnp.asarray(timestep, state.position.dtype),
+    )
+    return step, planes
+
+
+def take(
+    model: dict, scene: Scene, character: Character, state: ClothState, window: Window, timestep: Array, config: Config
+) -> tuple[ClothState, Taken]:
+    """One frame of Phi; `model` holds `params` and `statistics`. The state returned is still at the current root."""
+    step, planes = time_step(character, state, window, timestep, config)
+    nearest = planes.index
+    if config.physics.contact_surface == "faces":
+        nearest = contact.nearest(state.position, window.current.body)
+    new, latent, seen = compact_latent.step(
+        model["params"], model["statistics"], scene, character, state, window, planes, nearest,
+        step.timestep, config.model, config.material,
+    )  # fmt: skip
+    velocity = new - state.position
+    return ClothState(new, velocity, velocity - state.velocity, latent), Taken(new, step, seen)
+
+
+def follow(state: ClothState, advance: Array) -> ClothState:
+    """The same state relative to the root of the next frame, which is `advance` [3] m further on."""
+    return state._replace(position=state.position - advance[None])
+
+
+def settle(
+    model: dict, scene: Scene, character: Character, poses: Pose, config: Config
+) -> ClothState:
+    """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
+    window = characters.window(scene, character, poses, config.physics)
+    size = _latent_size(scene, config)
+    state = start(character, window, size)
+    if config.stage1.start_timestep == 0:
+        return state
+    settled, _ = take(
+        model, scene, character, state._replace(velocity=jnp.zeros_like(state.velocity)),
+        Window(window.current, window.current, window.current), config.stage1.start_timestep, config,
+    )  # fmt: skip
+    return settled._replace(velocity=state.velocity, acceleration=state.acceleration)
+
+
+def training_rollout(
+    params: dict,
+    statistics: dict,
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    clips: Clips,
+    frame: Array,
+    fresh: Array,
+    training_step: Array,
+    frames: int,
+    config: Config,
+) -> tuple[Array, tuple[ClothState, dict, Features]]:
+    """Mean loss over `frames` frames of Phi from a state, with the last state, mean energies in J, and all features.
+
+    A `fresh` state takes the quasi-static step first: the body stands, the step is long, and what it started with as
+    velocity is given back after it. Between frames gradients stop, as in HOOD.
+    """
+
+    def body(carry, _):
+        state, frame, fresh = carry
+        state = jax.lax.stop_gradient(state)
+        poses = motion.poses(clips, frame)
+        still = motion.standing(poses)
+        chosen = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), still, poses)
+        window = characters.window(scene, character, chosen, config.physics)
+        velocity = jnp.where(fresh, 0.0, state.velocity)
+        timestep = jnp.where(fresh, config.stage1.start_timestep, 1.0 / config.fps)
+        model = {"params": params, "statistics": statistics}
+        taken, (new, step, seen) = take(
+            model, scene, character, state._replace(velocity=velocity), window, timestep, config
+        )
+        terms = losses.energies(new, step, scene.mesh, config.physics)
+        loss = losses.weighted(terms, config.loss, training_step)
+        taken = taken._replace(
+            velocity=jnp.where(fresh, state.velocity, taken.velocity),
+            acceleration=jnp.where(fresh, 0.0, taken.acceleration),
+        )
+        taken = follow(taken, chosen.translation[2])
+        frame = jnp.where(fresh, frame, frame + 1)
+        return (taken, frame, jnp.zeros_like(fresh)), (loss, terms, seen)
+
+    (state, frame, fresh), (loss, terms, seen) = jax.lax.scan(body, (state, frame, fresh), None, length=frames)
+    terms = {name: jnp.mean(value) for name, value in terms.items()}
+    return jnp.mean(loss), (jax.lax.stop_gradient(state), terms, jax.lax.stop_gradient(seen))
+
+
+def play(model: dict, scene: Scene, character: Character, poses: Pose, config: Config):
+    """Phi in closed loop over a motion.
+
+    Args:
+        model: `params` and `statistics`.
+        poses: windows [T, 3, ...] of `clips.poses`.
+
+    Returns:
+        (new [T, V, 3] m relative to each window's current root, states before each step [T], latents [T, L]).
+    """
+    first = jax.tree.map(lambda x: x[0], poses)
+    state = settle(model, scene, character, first, config)
+
+    def body(state, poses):
+        window = characters.window(scene, character, poses, config.physics)
+        taken, (new, _, _) = take(model, scene, character, state, window, 1.0 / config.fps, config)
+        return follow(taken, poses.translation[2]), (new, state, taken.latent)
+
+    return jax.lax.scan(body, state, poses)[1]
+
+
+def _latent_size(scene: Scene, config: Config) -> int:
+    left, channels = compact_latent.latent_size(scene, config.model)
+    return left * channels

@@ -1,0 +1,111 @@
+"""What stays fixed while an experiment runs: garment, the body within its reach, graphs and tables. NumPy only."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial import cKDTree
+
+from clothjax import graph_sampling, topology
+from clothjax.config import Config
+from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
+
+
+class Table(NamedTuple):
+    """One mesh-convolution block's neighbours: output p reads inputs ids[p, k] where mask[p, k]."""
+
+    ids: Array  # [P, N] int32, padded with the number of inputs
+    mask: Array  # [P, N] bool
+
+
+class Scene(NamedTuple):
+    """The fixed part of a simulation."""
+
+    garment: Garment
+    body: Body  # only the vertices that the garment can reach
+    mesh: Mesh
+    graph: dict[str, EdgeSet]  # `mesh`, and the coarse levels in use
+    level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
+    tables: tuple[Table, ...]
+
+
+def build(garment: Garment, body: Body, config: Config) -> Scene:
+    """The scene of a garment on a body; deterministic."""
+    faces = np.asarray(garment.faces)
+    used = {name for stack in config.model.processor for name in stack.edges}
+    depth = 1 + max((int(name.removeprefix("coarse")) for name in used if name != "mesh"), default=-1)
+    levels = graph_sampling.coarse_levels(faces, depth) if depth else []
+    for index, level in enumerate(levels):
+        if f"coarse{index}" in used and len(level) == 0:
+            raise ValueError(
+                f"coarse level {index} of this garment ({len(garment.vertices)} vertices) is empty; "
+                f"leave coarse{index} out of model.processor"
+            )
+    graph = {"mesh": topology.directed(topology.edges(faces))}
+    graph |= {f"coarse{i}": topology.directed(level) for i, level in enumerate(levels) if f"coarse{i}" in used}
+    hierarchy = graph_sampling.hierarchy(
+        faces,
+        len(garment.vertices),
+        strides=[level.stride for level in config.model.convolution],
+        radii=[level.radius for level in config.model.convolution],
+    )
+    return Scene(
+        garment=garment,
+        body=reachable(body, garment, config.physics.reach),
+        mesh=topology.mesh(faces, len(garment.vertices)),
+        graph=graph,
+        level=graph_sampling.vertex_levels(len(garment.vertices), levels).astype(np.int32),
+        tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
+    )
+
+
+def reachable(body: Body, garment: Garment, reach: float) -> Body:
+    """The part of a body that a garment can touch: vertices within `reach` m of it in the canonical pose.
+
+    The cut must lie far from the garment: a tangent plane at its edge would act as a wall through the air.
+    Vertices that move with joints driving no part of the garment's neighbourhood (head, hands, feet of a shirt)
+    are left out by the distance alone, so `reach` should exceed how far the garment slides along the body.
+    """
+    distance, _ = cKDTree(garment.vertices).query(body.vertices)
+    inside = distance < reach
+    faces = np.asarray(body.faces)
+    kept_faces = faces[inside[faces].all(axis=1)]
+    kept = np.unique(kept_faces)
+    renumbered = np.full(len(inside), -1, np.int32)
+    renumbered[kept] = np.arange(len(kept), dtype=np.int32)
+    return body._replace(
+        vertices=body.vertices[kept],
+        faces=renumbered[kept_faces],
+        weights=body.weights[kept],
+        shapedirs=body.shapedirs[kept],
+        posedirs=None if body.posedirs is None else body.posedirs[kept],
+    )
+
+
+def laplacian_basis(scene: Scene, count: int, stiffness: float, density: float, timestep: float) -> np.ndarray:
+    """Blend shapes [K, V, 3] m to start training from: mass-scaled Laplacian eigenvectors, each along x, y and z.
+
+    Mode i is divided by sqrt(w_i + 1 / dt^2), so that a unit weight costs about the same energy in every mode
+    (stretching by `stiffness` N/m, inertia over `timestep` s). Pinned vertices do not move.
+    """
+    vertices = np.asarray(scene.garment.vertices, np.float64)
+    edges = topology.edges(np.asarray(scene.garment.faces))
+    free = np.flatnonzero(~np.asarray(scene.garment.pinned))
+    corners = vertices[np.asarray(scene.garment.faces)]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    mass = np.zeros(len(vertices))
+    np.add.at(mass, np.asarray(scene.garment.faces).ravel(), np.repeat(area * density / 3, 3))
+    laplacian = np.zeros((len(vertices), len(vertices)))
+    laplacian[edges[:, 0], edges[:, 1]] = laplacian[edges[:, 1], edges[:, 0]] = -stiffness
+    np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
+    modes = min(-(-count // 3), len(free))
+    values, vectors = scipy.linalg.eigh(
+        laplacian[np.ix_(free, free)], np.diag(mass[free]), subset_by_index=[0, modes - 1]
+    )
+    scaled = vectors / np.sqrt(np.maximum(values, 0) + 1 / timestep**2)
+    basis = np.zeros((modes, 3, len(vertices), 3))
+    for axis in range(3):
+        basis[:, axis, free, axis] = scaled.T
+    basis = basis.reshape(-1, len(vertices), 3)[:count]
+    missing = count - len(basis)
+    return np.concatenate([basis, np.zeros((missing, *basis.shape[1:]))]).astype(np.float32)

@@ -1,0 +1,226 @@
+"""Stage 1: Phi trained on the physics alone, in rollouts of a pool of persistent simulations."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from clothjax import character as characters
+from clothjax import clips as motion
+from clothjax import compact_latent, losses, rollout
+from clothjax.clips import Clips
+from clothjax.config import Config, Range
+from clothjax.features import Features
+from clothjax.scene import Scene, laplacian_basis
+from clothjax.types import Array, ClothState, Material
+
+
+class Simulation(NamedTuple):
+    """One character under way. In the pool every leaf has a leading axis."""
+
+    cloth: ClothState
+    betas: Array  # [S]
+    material: Material
+    frame: Array  # int32, of the clips
+    fresh: Array  # bool, before its quasi-static step
+
+
+class TrainingState(NamedTuple):
+    """All that stage 1 is at a step: resuming from it is exact."""
+
+    step: Array  # int32
+    key: Array
+    params: dict
+    average: dict  # exponential moving average of the parameters
+    optimizer: optax.OptState
+    statistics: dict
+    pool: Simulation
+
+
+def sample_material(key: Array, config: Config) -> Material:
+    """A material from the training ranges, or the configured one."""
+    cloth = config.material
+    if not cloth.sample:
+        return default_material(config)
+
+    def draw(key: Array, limits: Range) -> Array:
+        uniform = jax.random.uniform(key)
+        if limits.log:
+            return limits.low * (limits.high / limits.low) ** uniform
+        return limits.low + (limits.high - limits.low) * uniform
+
+    ranges = (cloth.density_range, cloth.mu_range, cloth.lam_range, cloth.bending_range)
+    return Material(*(draw(k, limits) for k, limits in zip(jax.random.split(key, 4), ranges)))
+
+
+def default_material(config: Config) -> Material:
+    """The configured material."""
+    cloth = config.material
+    return Material(*(jnp.float32(value) for value in (cloth.density, cloth.mu, cloth.lam, cloth.bending)))
+
+
+def optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam behind a clipped norm, at a rate that is constant, then decays; slower for the blend shapes."""
+    stage = config.stage1
+    hold = max(1, int(stage.decay_start * stage.steps))
+    decay = optax.exponential_decay(
+        stage.learning_rate, max(1, stage.steps - hold), stage.decay_end, end_value=stage.learning_rate * stage.decay_end
+    )
+    warm = min(200, hold)
+    schedule = optax.join_schedules(
+        [optax.linear_schedule(0.01 * stage.learning_rate, stage.learning_rate, warm),
+         optax.constant_schedule(stage.learning_rate), decay],
+        [warm, hold],
+    )  # fmt: skip
+
+    def slower(updates):
+        return jax.tree_util.tree_map_with_path(
+            lambda path, u: stage.blendshape_rate * u if "blendshapes" in jax.tree_util.keystr(path) else u, updates
+        )
+
+    return optax.chain(
+        optax.clip_by_global_norm(stage.clip),
+        optax.scale_by_adam(b2=stage.adam_b2),
+        optax.stateless(lambda updates, _: slower(updates)),
+        optax.scale_by_learning_rate(schedule),
+    )
+
+
+def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
+    """A new simulation: random clip and frame, betas and material, skinned."""
+    keys = jax.random.split(key, 3)
+    betas = jax.random.uniform(
+        keys[0], (scene.body.shapedirs.shape[-1],), minval=-config.stage1.betas, maxval=config.stage1.betas
+    )
+    material = sample_material(keys[1], config)
+    frame = motion.draw(clips, jax.random.uniform(keys[2]))
+    character = characters.dress(scene, betas, material, config.physics)
+    window = characters.window(scene, character, motion.poses(clips, frame), config.physics)
+    left, channels = compact_latent.latent_size(scene, config.model)
+    cloth = rollout.start(character, window, left * channels)
+    return Simulation(cloth, betas, material, frame, jnp.asarray(config.stage1.start_timestep > 0))
+
+
+def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
+    """The state before the first step."""
+    key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
+    stiffness = physical_stiffness(config)
+    basis = laplacian_basis(
+        scene, config.model.blendshapes, stiffness, config.material.density, 1.0 / config.fps
+    )
+    # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
+    example = example_features(scene, clips, config)
+    params = compact_latent.init(model_key, scene, example, 0.1 * basis, config.model)
+    pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(
+        jax.random.split(pool_key, config.stage1.pool)
+    )
+    return TrainingState(
+        step=jnp.int32(0),
+        key=key,
+        params=params,
+        average=jax.tree.map(jnp.array, params),
+        optimizer=optimizer(config).init(params),
+        statistics=compact_latent.init_statistics(example),
+        pool=pool,
+    )
+
+
+def physical_stiffness(config: Config) -> float:
+    """Membrane stiffness of the configured cloth in N/m, as the Laplacian of a spring network would have it."""
+    return 0.25 * 4.7e-4 * (2 * config.material.mu + config.material.lam)
+
+
+def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
+    """Shapes of the inputs of Phi in this scene, without computing any."""
+
+    def features(key):
+        simulation = begin(key, scene, clips, config)
+        character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
+        window = characters.window(scene, character, motion.poses(clips, simulation.frame), config.physics)
+        _, planes = rollout.time_step(character, simulation.cloth, window, 1.0 / config.fps, config)
+        return compact_latent.feature.features(
+            scene, character, simulation.cloth, window, planes, planes.index, jnp.float32(1.0 / config.fps),
+            config.model, config.material,
+        )  # fmt: skip
+
+    return jax.eval_shape(features, jax.random.key(0))
+
+
+def rollout_length(step: int, config: Config) -> int:
+    """Frames of one update at a training step: the curriculum."""
+    stage = config.stage1
+    return min(max(stage.rollout, stage.rollout_end), stage.rollout + step // stage.rollout_every)
+
+
+def make_update(
+    scene: Scene, clips: Clips, config: Config, frames: int, steps: int
+) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
+    """A function that takes `steps` training steps of `frames` frames each, and its metrics [steps]."""
+    stage = config.stage1
+    transform = optimizer(config)
+
+    def loss_of(params, statistics, simulation, step):
+        character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
+        return rollout.training_rollout(
+            params, statistics, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
+            step, frames, config,
+        )  # fmt: skip
+
+    def batch_loss(params, statistics, simulations, step):
+        loss, rest = jax.vmap(loss_of, (None, None, 0, None))(params, statistics, simulations, step)
+        return jnp.mean(loss), (loss, rest)
+
+    def one(state: TrainingState, _):
+        key, begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
+        chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
+        simulations = jax.tree.map(lambda x: x[chosen], state.pool)
+        restart = jax.random.uniform(restart_key, (stage.batch,)) < stage.restart_probability
+        restart |= clips.remaining[simulations.frame] < frames
+        fresh = jax.vmap(lambda k: begin(k, scene, clips, config))(jax.random.split(begin_key, stage.batch))
+        simulations = jax.tree.map(lambda a, b: _where(restart, a, b), fresh, simulations)
+
+        (loss, (each, (cloth, terms, seen))), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
+            state.params, state.statistics, simulations, state.step
+        )
+        norm = optax.global_norm(gradient)
+        good = jnp.isfinite(norm) & jnp.isfinite(loss)
+        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
+        updates, optimizer_state = transform.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, updates)
+        # a blown-up simulation starts anew at its next turn; so does one whose update was skipped
+        lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0) | ~jnp.isfinite(each)
+        advance = jnp.where(simulations.fresh, frames - 1, frames)
+        frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advance)
+        cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
+        following = Simulation(
+            cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh)
+        )
+
+        def only_if_good(new, old):
+            return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+
+        statistics = compact_latent.observe(state.statistics, seen, config.model.normalizer_steps)
+        average = jax.tree.map(
+            lambda a, p: stage.ema * a + (1 - stage.ema) * p, state.average, params
+        )
+        new = TrainingState(
+            step=state.step + 1,
+            key=state.key,
+            params=only_if_good(params, state.params),
+            average=only_if_good(average, state.average),
+            optimizer=only_if_good(optimizer_state, state.optimizer),
+            statistics=only_if_good(statistics, state.statistics),
+            pool=jax.tree.map(lambda pool, value: pool.at[chosen].set(value), state.pool, following),
+        )
+        metrics = {"loss": loss, "gradient_norm": norm, "nonfinite": ~good, "lost": jnp.sum(lost)}
+        metrics |= {name: jnp.mean(terms[name]) for name in losses.TERMS}
+        return new, metrics
+
+    return lambda state: jax.lax.scan(one, state, None, length=steps)
+
+
+def _where(condition: Array, new: Array, old: Array) -> Array:
+    shaped = condition.reshape(condition.shape + (1,) * (new.ndim - condition.ndim))
+    return jnp.where(shaped, new, old)
