@@ -1,7 +1,7 @@
-"""The reference solver: a time step of the cloth as the minimum of exactly the potential that training minimises.
+"""The reference solver: a time step of the cloth as the minimum of the very potential that training minimises.
 
-Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how far a
-network is from the optimum; it is never used to train.
+Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how far
+a network is from the optimum; it is never used to train.
 """
 
 from functools import partial
@@ -23,14 +23,12 @@ SHORTEST_STEP = 1e-8
 
 
 class Structure(NamedTuple):
-    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and where element blocks are added to it."""
+    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and where element blocks go in it."""
 
     indptr: np.ndarray  # [V + 1] int32
     indices: np.ndarray  # [N] int32, column of each block
     diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
-    target: (
-        np.ndarray
-    )  # [9 F + 16 H + V] int32, block of every pair of corners of every face, hinge and vertex
+    target: np.ndarray  # [9 F + 16 H + V] int32, the block of each pair of corners of an element
 
 
 class SolverInfo(NamedTuple):
@@ -66,13 +64,14 @@ def solve_step(
     config: PhysicsConfig,
     *,
     tolerance: float = 1e-3,
-    max_iterations: int = 200,
+    max_iterations: int = 500,
 ) -> tuple[np.ndarray, SolverInfo]:
     """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
 
-    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned by the
-    3 x 3 diagonal blocks of a positive semidefinite one (`gauss_newton`), then a line search. The minimum is a
-    local one: folds have many. Contact planes and the friction mask are those of `step`, so the potential is smooth.
+    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned by
+    the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The minimum is
+    a local one, of which folds have many: compare energies, not positions. Contact planes and the friction mask
+    are those of `step`, so the potential is smooth.
 
     Args:
         new0: [V, 3] m, where to start; pinned vertices stay there.
@@ -80,22 +79,19 @@ def solve_step(
         mesh: faces and hinges.
         pinned: [V] bool.
         config: constants of contact and friction.
-        tolerance: the norm of the remaining force on the free vertices at which to stop, as a fraction of the norm
-            of their weights. It does not depend on the start, which a penetration can make as bad as one likes.
+        tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the norm
+            of their weights. This does not depend on the start, where a penetration can make any force.
         max_iterations: Newton iterations.
 
     Returns:
         Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met.
 
     Raises:
-        ValueError: an input position that is not finite.
+        ValueError: a start that is not finite, or a vertex without mass.
     """
     x = np.array(new0, np.float64)
-    if not np.isfinite(x).all():
-        raise ValueError(
-            f"solve_step: new0 has values that are not finite, first at vertex {int(np.argwhere(~np.isfinite(x))[0, 0])}"
-        )
     step = jax.tree.map(_to_float64, step)
+    _check(x, step)
     mesh = Mesh(np.asarray(mesh.faces), np.asarray(mesh.hinges))
     pattern = structure(mesh, len(x))
     free = np.broadcast_to(~np.asarray(pinned, bool)[:, None], x.shape)
@@ -108,7 +104,8 @@ def solve_step(
         iterations = 0
         while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
             exact, semidefinite = hessian(x)
-            forcing = min(0.1, np.sqrt(np.linalg.norm(gradient) / weight * 1e-1))
+            # inexact far away, more exact as the gradient falls: the last iterations converge superlinearly
+            forcing = min(0.1, np.sqrt(0.1 * np.linalg.norm(gradient) / weight))
             direction = _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing)
             iterations += 1
             x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
@@ -124,8 +121,8 @@ def hessians(
 ) -> tuple[Array, Array]:
     """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
 
-    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the square of
-    the residual's gradient (Gauss-Newton); of the terms of single vertices, the positive eigenvalues.
+    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the square
+    of the residual's gradient (Gauss-Newton); of the terms of single vertices, the positive eigenvalues.
     """
     rest, material = step.rest, step.material
     corners, hinges = x[mesh.faces], x[mesh.hinges]
@@ -223,13 +220,25 @@ def _host(result, free) -> tuple[float, np.ndarray]:
     return float(energy), np.where(free, np.asarray(gradient), 0.0)
 
 
+def _check(x: np.ndarray, step: TimeStep) -> None:
+    bad = ~np.isfinite(x).all(axis=1)
+    if bad.any():
+        raise ValueError(f"solve_step: new0[{np.argmax(bad)}] is {x[np.argmax(bad)]}; a start must be finite")
+    if not (step.mass > 0).all():
+        vertex = np.argmin(step.mass)
+        raise ValueError(
+            f"solve_step: vertex {vertex} has mass {step.mass[vertex]} kg, which must be > 0; "
+            "remove vertices that belong to no face of positive area"
+        )
+
+
 def _to_float64(leaf: Array) -> np.ndarray:
     leaf = np.asarray(leaf)
     return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
 
 
 def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
-    """A descent direction [V, 3] m: the Newton step to a relative residual `forcing`, or up to negative curvature."""
+    """A descent direction [V, 3] m: the Newton step to a residual of `forcing`, or up to negative curvature."""
     # with D = L L^T the diagonal blocks, solve (L^-1 H L^-T) y = -L^-1 g: no preconditioner inside the loop
     root = np.linalg.inv(np.linalg.cholesky(np.asarray(semidefinite)[pattern.diagonal]))
     rows = np.repeat(np.arange(len(root)), np.diff(pattern.indptr))
@@ -264,7 +273,8 @@ def _line_search(evaluate, x, energy, gradient, direction, free):
     while length >= SHORTEST_STEP:
         trial = x + length * direction
         trial_energy, trial_gradient = _host(evaluate(trial), free)
-        if trial_energy <= energy + 1e-4 * length * slope:
+        # the last term: near the minimum the decrease drowns in the rounding of the energy
+        if trial_energy <= energy + 1e-4 * length * slope + 1e-14 * abs(energy):
             return trial, trial_energy, trial_gradient, True
         length *= 0.5
     return x, energy, gradient, False
