@@ -1,7 +1,7 @@
-"""The reference solver: a time step of the cloth as the minimum of the very potential that training minimises.
+"""The reference solver: a time step of the cloth as the minimum of the potential that training minimises.
 
-Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how far
-a network is from the optimum; it is never used to train.
+Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how
+far a network is from the optimum; it is never used to train.
 """
 
 from functools import partial
@@ -68,10 +68,10 @@ def solve_step(
 ) -> tuple[np.ndarray, SolverInfo]:
     """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
 
-    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned by
-    the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The minimum is
-    a local one, of which folds have many: compare energies, not positions. Contact planes and the friction mask
-    are those of `step`, so the potential is smooth.
+    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned
+    by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The minimum
+    is a local one, of which folds have many: compare energies, not positions. Contact planes and the friction
+    mask are those of `step`, so the potential is smooth.
 
     Args:
         new0: [V, 3] m, where to start; pinned vertices stay there.
@@ -79,8 +79,8 @@ def solve_step(
         mesh: faces and hinges.
         pinned: [V] bool.
         config: constants of contact and friction.
-        tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the norm
-            of their weights. This does not depend on the start, where a penetration can make any force.
+        tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the
+            norm of their weights. This does not depend on the start, where penetration can make any force.
         max_iterations: Newton iterations.
 
     Returns:
@@ -121,8 +121,8 @@ def hessians(
 ) -> tuple[Array, Array]:
     """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
 
-    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the square
-    of the residual's gradient (Gauss-Newton); of the terms of single vertices, the positive eigenvalues.
+    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the
+    square of the residual's gradient (Gauss-Newton); of terms of single vertices, the positive eigenvalues.
     """
     rest, material = step.rest, step.material
     corners, hinges = x[mesh.faces], x[mesh.hinges]
@@ -238,7 +238,7 @@ def _to_float64(leaf: Array) -> np.ndarray:
 
 
 def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
-    """A descent direction [V, 3] m: the Newton step to a residual of `forcing`, or up to negative curvature."""
+    """A descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature."""
     # with D = L L^T the diagonal blocks, solve (L^-1 H L^-T) y = -L^-1 g: no preconditioner inside the loop
     root = np.linalg.inv(np.linalg.cholesky(np.asarray(semidefinite)[pattern.diagonal]))
     rows = np.repeat(np.arange(len(root)), np.diff(pattern.indptr))
