@@ -69,9 +69,9 @@ def solve_step(
     """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
 
     Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned
-    by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The minimum
-    is a local one, of which folds have many: compare energies, not positions. Contact planes and the friction
-    mask are those of `step`, so the potential is smooth.
+    by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The
+    minimum is a local one, of which folds have many: compare energies, not positions. Contact planes and the
+    friction mask are those of `step`, so the potential is smooth.
 
     Args:
         new0: [V, 3] m, where to start; pinned vertices stay there.
