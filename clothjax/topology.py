@@ -15,12 +15,12 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
         vertex_count: V, by default the highest index plus one.
 
     Returns:
-        Mesh with hinges [H, 4] sorted by edge: (a, b) as directed in the left face, which comes first in `faces`,
-        then the vertex opposite the edge in the left and in the right face. Where three or more faces share an
-        edge the first two make the hinge, as in HOOD (Grigorev et al. 2023).
+        Mesh with hinges [H, 4] sorted by edge: (a, b) as directed in the left face, the first in `faces`, and
+        the vertices opposite it in the left and in the right face. Where three or more faces share an edge the
+        first two make the hinge, as in HOOD (Grigorev et al. 2023).
 
     Raises:
-        ValueError: an index out of range, a vertex repeated within a face, or not an [F, 3] array of integers.
+        ValueError: an index out of range, a vertex twice in a face, or not an [F, 3] array of integers.
     """
     faces = _checked(faces, vertex_count)
     corners, sorted_edges = _corners(faces)
@@ -33,12 +33,12 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
 
 
 def edges(faces: np.ndarray) -> np.ndarray:
-    """Undirected edges [E, 2] int32 of faces [F, 3], each with its lower index first, sorted, without repeats."""
+    """Undirected edges [E, 2] int32 of faces [F, 3], lower index first, sorted, without repeats."""
     return np.unique(_corners(_checked(faces))[1], axis=0).astype(np.int32).reshape(-1, 2)
 
 
 def directed(undirected: np.ndarray) -> EdgeSet:
-    """Both directions of undirected edges [E, 2] as an edge set [2 E], sorted by receiver and then by sender."""
+    """Both directions of undirected edges [E, 2], sorted by receiver, then by sender."""
     undirected = np.asarray(undirected, np.int32).reshape(-1, 2)
     both = np.concatenate([undirected, undirected[:, ::-1]])
     both = both[np.lexsort((both[:, 0], both[:, 1]))]
@@ -67,43 +67,32 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
         faces: [F, 3] vertex indices.
 
     Returns:
-        For each loop its vertices [N] int32 in order, starting at its lowest vertex and running as in the faces
-        where these agree; loops in order of their lowest vertices. Loops that touch in one vertex come apart there.
-        A run of edges that does not close, which only edges with three faces or more cause, is returned as it is.
+        Vertices [N] int32 of each loop, from its lowest on and as directed in the faces, where these agree;
+        loops in order of their lowest vertices. Loops that share a vertex come out as one. Edges with three
+        faces or more may leave runs that do not close.
     """
-    half_edges = _boundary(faces)
-    leaving: dict[int, list[tuple[int, int]]] = {}
-    # A half-edge is offered to its head last, so that it is walked backwards only where faces disagree.
-    for index, (a, b) in enumerate(half_edges.tolist()):
-        leaving.setdefault(a, []).insert(0, (index, b))
-    for index, (a, b) in enumerate(half_edges.tolist()):
-        leaving.setdefault(b, []).append((index, a))
-    used = np.zeros(len(half_edges), bool)
+    half_edges = _boundary(faces).tolist()
+    # Backward steps come last, so that a half-edge is walked backwards only where the faces disagree.
+    steps: dict[int, list[tuple[int, int]]] = {}
+    for index, (a, b) in enumerate(half_edges):
+        steps.setdefault(a, []).append((index, b))
+    for index, (a, b) in enumerate(half_edges):
+        steps.setdefault(b, []).append((index, a))
+    used: set[int] = set()
+
+    def step(vertex):
+        return next(((index, head) for index, head in steps[vertex] if index not in used), None)
+
     loops = []
-    for start in sorted(leaving):
-        while (step := _unused(leaving[start], used)) is not None:
-            loop, place = [start], {start: 0}
-            while step is not None:
-                used[step[0]] = True
-                vertex = step[1]
-                if vertex in place:
-                    cycle = loop[place[vertex] :]
-                    loops.append(cycle)
-                    del loop[place[vertex] + 1 :]
-                    for passed in cycle[1:]:
-                        del place[passed]
-                else:
-                    place[vertex] = len(loop)
-                    loop.append(vertex)
-                step = _unused(leaving[vertex], used)
-            if len(loop) > 1:
-                loops.append(loop)
-    turned = [np.roll(np.array(loop, np.int32), -int(np.argmin(loop))) for loop in loops]
-    return sorted(turned, key=lambda loop: tuple(loop.tolist()))
-
-
-def _unused(steps: list[tuple[int, int]], used: np.ndarray) -> tuple[int, int] | None:
-    return next((step for step in steps if not used[step[0]]), None)
+    for start in sorted(steps):
+        while (taken := step(start)) is not None:
+            loop = [start]
+            while taken is not None:
+                used.add(taken[0])
+                loop.append(taken[1])
+                taken = step(taken[1])
+            loops.append(np.array(loop[:-1] if loop[-1] == start else loop, np.int32))
+    return loops
 
 
 def _boundary(faces: np.ndarray) -> np.ndarray:
@@ -114,7 +103,7 @@ def _boundary(faces: np.ndarray) -> np.ndarray:
 
 
 def _corners(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each face's three edges with the vertex opposite, [3 F, 3] in file order, and the edges sorted [3 F, 2]."""
+    """Every face's edges and the vertices opposite [3 F, 3] in file order; the edges, sorted [3 F, 2]."""
     corners = np.stack([faces, np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=1).reshape(-1, 3)
     return corners, np.sort(corners[:, :2], axis=1)
 
@@ -123,7 +112,7 @@ def _checked(faces: np.ndarray, vertex_count: int | None = None) -> np.ndarray:
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(
-            f"faces must be an [F, 3] array of integers, not {faces.dtype} {list(faces.shape)}; triangulate the mesh"
+            f"faces must be integers [F, 3], not {faces.dtype} {list(faces.shape)}; triangulate the mesh"
         )
     limit = int(faces.max(initial=-1)) + 1 if vertex_count is None else vertex_count
     outside = ((faces < 0) | (faces >= limit)).any(axis=1)
