@@ -1,10 +1,12 @@
 """The energies of cloth, each from positions and constants: no weights, no networks.
 
-Elementwise functions return one value per face, hinge or vertex, so that the same code gives the loss (a sum),
-the force (its gradient) and the reference solver's Hessian (its second derivative, element by element).
-Every function is finite with a finite gradient at zero edges, zero areas, flat and folded hinges and zero slip.
+Elementwise functions return one value per face, hinge or vertex, so that the same code gives the loss (a
+sum), the force (its gradient) and the reference solver's Hessian (second derivative, element by element).
+Every function is finite, with a finite gradient, at zero edges, zero areas, flat and folded hinges and zero
+slip.
 """
 
+import jax
 import jax.numpy as jnp
 
 from clothjax.types import Array, Mesh, Rest
@@ -37,7 +39,9 @@ def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:
         face_area=face_area,
         hinge_area=_triangle_areas(vertices[mesh.hinges]),
         hinge_angle=jnp.zeros_like(angle) if flat else angle,
-        vertex_area=jnp.zeros_like(vertices[:, 0]).at[mesh.faces.reshape(-1)].add(jnp.repeat(face_area / 3.0, 3)),
+        vertex_area=jnp.zeros_like(vertices[:, 0])
+        .at[mesh.faces.reshape(-1)]
+        .add(jnp.repeat(face_area / 3.0, 3)),
     )
 
 
@@ -49,7 +53,9 @@ def green_strain(corners: Array, inverse: Array) -> Array:
     return 0.5 * (metric - jnp.eye(2, dtype=corners.dtype)[None])
 
 
-def stretching(corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=THICKNESS) -> Array:
+def stretching(
+    corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=THICKNESS
+) -> Array:
     """Saint Venant-Kirchhoff energy [F] J: A h (mu tr(G^2) + lambda/2 tr(G)^2) of triangles [F, 3, 3] m."""
     strain = green_strain(corners, inverse)
     trace = strain[:, 0, 0] + strain[:, 1, 1]
@@ -57,18 +63,21 @@ def stretching(corners: Array, inverse: Array, area: Array, mu: Array, lam: Arra
 
 
 def dihedral_angle(corners: Array) -> Array:
-    """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 when flat, and where a face has no area."""
+    """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 if flat, or where a face has no area."""
     edge = corners[:, 1] - corners[:, 0]
     left = jnp.cross(edge, corners[:, 2] - corners[:, 0])
     right = jnp.cross(corners[:, 3] - corners[:, 0], edge)
     sine = jnp.sum(jnp.cross(left, right) * edge, axis=-1)
     cosine = jnp.sum(left * right, axis=-1) * _norm(edge)
-    degenerate = (sine == 0) & (cosine == 0)
-    return jnp.where(degenerate, 0.0, jnp.arctan2(sine, jnp.where(degenerate, 1.0, cosine)))
+    # of fifth order in length: arctan2's derivative squares them, which underflows in float32 below 0.1 mm
+    scale = jax.lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
+    degenerate = scale == 0
+    scale = jnp.where(degenerate, 1.0, scale)
+    return jnp.where(degenerate, 0.0, jnp.arctan2(sine / scale, jnp.where(degenerate, 1.0, cosine / scale)))
 
 
 def bending(corners: Array, area: Array, rest_angle: Array, stiffness: Array) -> Array:
-    """Dihedral energy [H] J: k l^2 / (4 A) (theta - theta_0)^2 / 2, with l the current edge, A the rest area."""
+    """Dihedral energy [H] J: k l^2 / (4 A) (theta - theta_0)^2 / 2, l the current edge, A the rest area."""
     edge = corners[:, 1] - corners[:, 0]
     angle = dihedral_angle(corners) - rest_angle
     return stiffness * jnp.sum(edge * edge, axis=-1) / (8.0 * area) * angle * angle
@@ -80,17 +89,19 @@ def gravity(height: Array, mass: Array) -> Array:
 
 
 def inertia(deviation: Array, mass: Array, timestep: Array) -> Array:
-    """Incremental kinetic potential [V] J (16): m |x - (x_t + v_t)|^2 / (2 dt^2), the deviation [V, 3] m given."""
+    """Incremental kinetic potential [V] J (16): m |x - x_t - v_t|^2 / (2 dt^2) of the deviation, m."""
     return mass * jnp.sum(deviation * deviation, axis=-1) / (2.0 * timestep * timestep)
 
 
 def collision(distance: Array, offset=COLLISION_OFFSET) -> Array:
-    """Cubic penetration max(offset - d, 0)^3 [V] m^3 at signed distances [V] m; times a stiffness in J/m^3."""
+    """Cubic penetration max(offset - d, 0)^3 [V] m^3 at signed distances [V] m; times a stiffness, J/m^3."""
     depth = jnp.maximum(offset - distance, 0.0)
     return depth * depth * depth
 
 
-def friction(slip: Array, normal: Array, mass: Array, touching: Array, coefficient=0.5, smoothing=1e-4) -> Array:
+def friction(
+    slip: Array, normal: Array, mass: Array, touching: Array, coefficient=0.5, smoothing=1e-4
+) -> Array:
     """HOOD's friction potential [V] J: c g m kappa |tau| where a vertex touches the body.
 
     tau is the slip [V, 3] m relative to the body without its part along the contact normal [V, 3], and

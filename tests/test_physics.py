@@ -1,0 +1,318 @@
+"""Energies against HOOD's own values, finite differences, invariances and closed forms."""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from clothjax import contact, physics, rotation, topology
+
+DATA = Path(__file__).parent / "data"
+MU, LAM, STIFFNESS, DENSITY = 23600.0, 44400.0, 3.9625778333333325e-05, 0.20022  # HOOD's defaults
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def hood():
+    with np.load(DATA / "hood_energies.npz") as file:
+        return dict(file)
+
+
+def sheet(n=5, size=0.3, seed=0):
+    """A bumpy n x n sheet: (canonical vertices, posed vertices, mesh)."""
+    random = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(*[np.linspace(0, size, n)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    canonical = np.concatenate([grid, 0.02 * np.sin(20 * grid[:, :1])], axis=1)
+    i, j = np.divmod(np.arange((n - 1) ** 2), n - 1)
+    a = i * n + j
+    faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + n, a + n + 1, a + 1], 1)])
+    return canonical, canonical + 0.01 * random.standard_normal(canonical.shape), topology.mesh(faces)
+
+
+@partial(jax.jit, static_argnames="flat")
+def all_terms(posed, canonical, mesh, flat=False):
+    """Every energy of a posed sheet that hangs over a sphere, each summed."""
+    rest = physics.rest_measures(canonical, mesh, flat)
+    mass = rest.vertex_area * DENSITY
+    centre = np.array([0.15, 0.15, -0.3])
+    normal = canonical - centre[None]
+    normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
+    slip = posed - canonical
+    stuck = np.arange(len(canonical)) % 3 > 0
+    distance = contact.distance(posed, canonical, normal)
+    return {
+        "stretching": jnp.sum(physics.stretching(posed[mesh.faces], rest.inverse, rest.face_area, MU, LAM)),
+        "bending": jnp.sum(physics.bending(posed[mesh.hinges], rest.hinge_area, rest.hinge_angle, STIFFNESS)),
+        "gravity": jnp.sum(physics.gravity(posed[:, 1], mass)),
+        "inertia": jnp.sum(physics.inertia(slip, mass, 1 / 30)),
+        "collision": jnp.sum(physics.collision(distance)),
+        "friction": jnp.sum(physics.friction(slip, normal, mass, stuck)),
+    }
+
+
+@pytest.mark.parametrize("roll", range(3))
+def test_hood_energies(hood, roll, x64):
+    mesh = topology.mesh(hood["faces"])
+    rest = physics.rest_measures(hood["rest"], mesh)
+    mass = rest.vertex_area * DENSITY
+    np.testing.assert_allclose(mass, hood["mass"], rtol=1e-13)
+    # HOOD moves pinned vertices to their targets, without velocity, before each step
+    now, velocity = hood["cloth"][roll].copy(), hood["velocity"][roll].copy()
+    now[hood["pinned"]], velocity[hood["pinned"]] = hood["cloth_target"][roll], 0.0
+    new = hood["predicted"][roll]
+    body, following = (
+        contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body", "body_next")
+    )
+    touched = contact.find(now, body, following)
+    values = {
+        "stretching_energy": physics.stretching(new[mesh.faces], rest.inverse, rest.face_area, MU, LAM),
+        "bending_energy": physics.bending(new[mesh.hinges], rest.hinge_area, rest.hinge_angle, STIFFNESS),
+        "gravitational_energy": physics.gravity(new[:, 1], mass),
+        "inertia": physics.inertia(new - now - velocity, mass, hood["timestep"][roll]),
+        # never in contact here: this one says only that no vertex is found inside
+        "collision_penalty": physics.collision(
+            contact.distance(new, touched.point_next, touched.normal_next), 2e-3
+        ),
+    }
+    expected = dict(zip(hood["loss_names"], hood["losses"][roll]))
+    for name, value in values.items():
+        np.testing.assert_allclose(jnp.sum(value), expected[name], rtol=1e-10, err_msg=name)
+
+
+def test_hood_friction_with_its_traps(hood, x64):
+    """Squared radius, body a frame late, z as up, the mean of two normals not normalised.
+
+    Only the last step slips: in the others |tau| is 1e-9 m, below the 1e-8 that HOOD adds in its cosine.
+    """
+    roll = 2
+    now, new = hood["cloth"][roll].copy(), hood["predicted"][roll]
+    now[hood["pinned"]] = hood["cloth_target"][roll]
+    before, after = (
+        contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body_previous", "body")
+    )
+    p, q = contact.nearest(now, before[0]), contact.nearest(new, after[0])
+    near = (np.sum((now - before[0][p]) ** 2, axis=1) < 3e-3) & (
+        np.sum((new - after[0][q]) ** 2, axis=1) < 3e-3
+    )
+    slip = new - (now + after[0][p] - before[0][p])
+    normal = 0.5 * (before[1][p] + after[1][q])
+    z_to_y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    mass = hood["mass"]
+    energy = physics.friction(slip @ z_to_y.T, normal @ z_to_y.T, mass, near, 0.5, smoothing=0.0)
+    expected = dict(zip(hood["loss_names"], hood["losses"][roll]))["friction_energy"]
+    assert 0 < near.sum() < len(near)
+    np.testing.assert_allclose(jnp.sum(energy), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("term", ["stretching", "bending", "gravity", "inertia", "collision", "friction"])
+def test_gradients_are_those_of_finite_differences(term, x64):
+    canonical, posed, mesh = sheet()
+    value = jax.jit(lambda x: all_terms(x, canonical, mesh)[term])
+    gradient = np.asarray(jax.grad(value)(posed))
+    for seed in range(5):
+        direction = np.random.default_rng(seed).standard_normal(posed.shape)
+        step = 1e-6
+        difference = (value(posed + step * direction) - value(posed - step * direction)) / (2 * step)
+        np.testing.assert_allclose(np.sum(gradient * direction), difference, rtol=1e-6)
+
+
+def test_rigid_motion_leaves_elastic_energies(x64):
+    canonical, posed, mesh = sheet()
+    turn = np.asarray(rotation.from_axis_angle(np.array([0.7, -1.1, 2.0])))
+    before = all_terms(posed, canonical, mesh)
+    after = all_terms(posed @ turn.T + np.array([[3.0, -2.0, 1.0]]), canonical, mesh)
+    for name in ("stretching", "bending"):
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-10)
+    assert not np.isclose(after["gravity"], before["gravity"])
+
+
+def test_turning_about_the_vertical_leaves_friction_and_gravity(x64):
+    random = np.random.default_rng(1)
+    slip, normal = random.standard_normal((2, 20, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    mass, touching = random.uniform(1, 2, 20), np.ones(20, bool)
+    vertical = np.asarray(rotation.from_axis_angle(np.array([0.0, 0.9, 0.0])))
+    tilted = np.asarray(rotation.from_axis_angle(np.array([0.9, 0.0, 0.0])))
+    value = physics.friction(slip, normal, mass, touching)
+    turned = physics.friction(slip @ vertical.T, normal @ vertical.T, mass, touching)
+    np.testing.assert_allclose(turned, value, rtol=1e-12)
+    np.testing.assert_allclose((slip @ vertical.T)[:, 1], slip[:, 1], rtol=1e-12)
+    assert not np.allclose(physics.friction(slip @ tilted.T, normal @ tilted.T, mass, touching), value)
+
+
+def test_renumbering_vertices_changes_nothing(x64):
+    canonical, posed, mesh = sheet()
+    old_of_new = np.random.default_rng(3).permutation(len(canonical))
+    new_of_old = np.argsort(old_of_new)
+    renumbered = topology.mesh(new_of_old[mesh.faces])
+    before = physics.rest_measures(canonical, mesh, flat=False)
+    after = physics.rest_measures(canonical[old_of_new], renumbered, flat=False)
+    np.testing.assert_allclose(after.vertex_area, before.vertex_area[old_of_new], rtol=1e-12)
+    expected = all_terms(posed, canonical, mesh)
+    found = all_terms(posed[old_of_new], canonical[old_of_new], renumbered)
+    for name in ("stretching", "bending"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-12)
+
+
+A, B, LEFT, RIGHT = np.eye(3)[0] * 0, np.eye(3)[0], np.eye(3)[1], -np.eye(3)[1]
+HINGES = {
+    "flat": [A, B, LEFT, RIGHT],
+    "folded shut": [A, B, LEFT, LEFT],
+    "zero edge": [A, A, LEFT, RIGHT],
+    "zero left face": [A, B, 0.5 * B, RIGHT],
+    "both faces zero": [A, B, 0.5 * B, 2 * B],
+    "a point": [A, A, A, A],
+    "opposite vertex on the edge": [A, B, A, B],
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("size", [1.0, 0.03, 1e-4, 1e-7])
+def test_bending_is_finite_where_hinges_are_singular(size, dtype, x64):
+    hinges = (size * np.array(list(HINGES.values()))).astype(dtype)
+    ones = np.ones(len(hinges), dtype)
+
+    def energy(x):
+        values = physics.bending(x, 1e-4 * ones, 0.3 * ones, dtype(1e-5))
+        return jnp.sum(values), values
+
+    gradient, values = jax.jit(jax.grad(energy, has_aux=True))(hinges)
+    for name, value, slope in zip(HINGES, values, gradient):
+        assert np.isfinite(value) and np.isfinite(slope).all(), name
+    assert gradient.dtype == dtype
+
+
+def test_dihedral_angle_of_small_triangles_in_float32():
+    hinge = np.array([[A, B, LEFT, [0, -np.cos(1.0), np.sin(1.0)]]], np.float32)
+    large = jax.grad(lambda x: physics.dihedral_angle(x)[0])(hinge)
+    small = jax.grad(lambda x: physics.dihedral_angle(x)[0])(hinge * np.float32(1e-5))
+    np.testing.assert_allclose(small * np.float32(1e-5), large, rtol=1e-4, atol=1e-5)
+
+
+TRIANGLES = {
+    "zero edge": [A, A, B],
+    "on a line": [A, B, 2 * B],
+    "a point": [A, A, A],
+    "turned over": [LEFT, B, A],
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_stretching_is_finite_where_triangles_are_singular(dtype, x64):
+    triangles = np.array(list(TRIANGLES.values()), dtype)
+    inverse = np.broadcast_to(np.eye(2, dtype=dtype), (len(triangles), 2, 2))
+
+    def energy(x):
+        values = physics.stretching(x, inverse, np.ones(len(x), dtype), dtype(MU), dtype(LAM))
+        return jnp.sum(values), values
+
+    gradient, values = jax.jit(jax.grad(energy, has_aux=True))(triangles)
+    assert np.isfinite(values).all() and np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1e-4])
+def test_friction_is_finite_at_any_slip(smoothing):
+    slip = np.array([[0, 0, 0], [0, 0, 1e-30], [0, 1, 0], [0, 1e-3, 0], [1e-3, 0, 0]], np.float32)
+    normal = np.tile(np.array([[0, 0, 1]], np.float32), (5, 1))
+
+    def energy(x):
+        values = physics.friction(x, normal, np.ones(5, np.float32), np.ones(5, bool), 0.5, smoothing)
+        return jnp.sum(values), values
+
+    gradient, values = jax.jit(jax.grad(energy, has_aux=True))(slip)
+    assert np.isfinite(values).all() and np.isfinite(gradient).all()
+    # along the normal and at rest there is no friction
+    assert (values[:2] == 0).all() and (gradient[:2] == 0).all()
+    assert (values[2:] > 0).all()
+
+
+def test_friction_in_closed_form(x64):
+    slip = np.array([[3e-3, 0.0, 7.0], [0.0, 4e-3, -7.0], [3e-3, 4e-3, 0.0]])
+    normal, mass = np.tile([[0.0, 0, 1]], (3, 1)), np.full(3, 2.0)
+    kappa = np.sqrt(1 - np.array([0.0, 1.0, 0.8]) ** 2 + 1e-4)
+    expected = 0.5 * 9.81 * 2.0 * kappa * np.array([3e-3, 4e-3, 5e-3])
+    everywhere = np.ones(3, bool)
+    np.testing.assert_allclose(
+        physics.friction(slip, normal, mass, everywhere, 0.5, 0.0), expected, rtol=1e-12
+    )
+    # smoothing vanishes with its length, to first order
+    for smoothing in (1e-6, 1e-7):
+        smooth = physics.friction(slip, normal, mass, everywhere, 0.5, smoothing)
+        np.testing.assert_allclose(smooth, expected, rtol=400 * smoothing)
+    assert (physics.friction(slip, normal, mass, ~everywhere, 0.5, 0.0) == 0).all()
+
+
+def test_uniformly_stretched_triangle(x64):
+    canonical = np.array([[0.0, 0, 0], [2, 0, 0], [0.5, 1, 0]])
+    mesh = topology.mesh(np.array([[0, 1, 2]]))
+    rest = physics.rest_measures(canonical, mesh)
+    stretch = np.diag([1.1, 0.8, 1.0])
+    # G = (F^T F - I) / 2 in any orthonormal basis of the plane
+    strain = 0.5 * (np.diag([1.1**2, 0.8**2]) - np.eye(2))
+    density = MU * np.sum(strain**2) + 0.5 * LAM * np.trace(strain) ** 2
+    energy = physics.stretching((canonical @ stretch)[None], rest.inverse, rest.face_area, MU, LAM)
+    np.testing.assert_allclose(energy, 1.0 * 4.7e-4 * density, rtol=1e-12)
+    still = physics.stretching(canonical[None], rest.inverse, rest.face_area, MU, LAM)
+    np.testing.assert_allclose(still, 0.0, atol=1e-25)
+
+
+@pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 0.1, 1.5, 3.1])
+def test_known_dihedral_angle(angle, x64):
+    fold = [1.0, np.cos(np.pi - angle), np.sin(np.pi - angle)]
+    hinge = np.array([[[0, 0, 0], [2, 0, 0], [1, 1, 0], fold]])
+    np.testing.assert_allclose(np.abs(physics.dihedral_angle(hinge)), abs(angle), atol=1e-14)
+    # l^2 / (4 A) theta^2 / 2 with l = 2 and, to test that it is used, A = 5
+    energy = physics.bending(hinge, np.array([5.0]), np.zeros(1), 3.0)
+    np.testing.assert_allclose(energy, 3.0 * 4 / 20 * angle**2 / 2, atol=1e-13)
+
+
+def test_canonical_angle_is_the_rest_angle_unless_flat(x64):
+    canonical, _, mesh = sheet()
+    terms = all_terms(canonical, canonical, mesh, flat=False)
+    assert abs(terms["bending"]) < 1e-25 < 1e-9 < all_terms(canonical, canonical, mesh, flat=True)["bending"]
+
+
+def test_free_fall_is_the_minimum_of_gravity_and_inertia(x64):
+    mass, dt = np.array([0.3]), 1 / 30
+
+    def energy(x):
+        return (physics.gravity(x[:, 1], mass) + physics.inertia(x, mass, dt))[0]
+
+    gradient = jax.grad(energy)(np.array([[0.0, -9.81 * dt**2, 0.0]]))
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-14)
+
+
+def test_collision_is_the_cube_of_the_penetration(x64):
+    distance = np.array([-2e-3, 0.0, 2.999e-3, 3e-3, 1.0])
+    np.testing.assert_allclose(
+        physics.collision(distance), [1.25e-7, 2.7e-8, 1e-18, 0.0, 0.0], rtol=1e-6, atol=1e-30
+    )
+
+
+def test_rest_measures_are_those_of_numpy(x64):
+    canonical, _, mesh = sheet()
+    rest = physics.rest_measures(canonical, mesh, flat=False)
+    area = np.array([0.5 * np.linalg.norm(np.cross(b - a, c - a)) for a, b, c in canonical[mesh.faces]])
+    np.testing.assert_allclose(rest.face_area, area, rtol=1e-12)
+    vertex_area = np.zeros(len(canonical))
+    for face, value in zip(mesh.faces, area):
+        vertex_area[face] += value / 3
+    np.testing.assert_allclose(rest.vertex_area, vertex_area, rtol=1e-12)
+    for hinge, hinge_area, hinge_angle in zip(mesh.hinges, rest.hinge_area, rest.hinge_angle):
+        a, b, c, d = canonical[hinge]
+        first, second = np.cross(b - a, c - a), np.cross(d - a, b - a)
+        np.testing.assert_allclose(hinge_area, 0.5 * (np.linalg.norm(first) + np.linalg.norm(second)))
+        cosine = first @ second / np.linalg.norm(first) / np.linalg.norm(second)
+        np.testing.assert_allclose(np.cos(hinge_angle), cosine, rtol=1e-12)
+    for (a, b, c), inverse in zip(canonical[mesh.faces], rest.inverse):
+        # the edges in the plane: their inverse turns them into the identity metric
+        edges = np.stack([a - c, b - c], axis=1)
+        np.testing.assert_allclose(inverse.T @ edges.T @ edges @ inverse, np.eye(2), atol=1e-12)
