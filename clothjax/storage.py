@@ -1,18 +1,20 @@
 """Bodies, garments and motions as HDF5 files: one schema, checked when a file is opened.
 
-Lengths are metres, +Y is up. Every file has the attributes `format` (below), `version` 1, `name`, `units` "m",
-`up` "+Y", `licence` and `source`. Floats are float32 unless said otherwise; all is gzip-compressed.
+Lengths are metres, +Y is up. Every file has the attributes `format` (below), `version` 1, `name`,
+`units` "m", `up` "+Y", `licence` and `source`. Floats are float32 unless said otherwise.
 
-Body, `format` = "clothjax/body":
-    vertices [B, 3], faces [Fb, 3] int32, joints [J, 3], parents [J] int32 (root first with -1, parents before children),
-    joint_names [J] strings, weights_index [B, n] int16 and weights_value [B, n] (the n largest skinning weights of a
-    vertex, summing to 1), shapedirs [B, 3, S] and joint_shapedirs [J, 3, S] (per standard deviation);
-    optional posedirs [B, 3, 9 (J - 1)] and canonical_rotation [J, 3, 3] (turns each bone of the canonical pose to a T-pose).
-Garment, `format` = "clothjax/garment":
-    vertices [V, 3], faces [F, 3] int32, weights_index [V, n] int16, weights_value [V, n], shapedirs [V, 3, S],
-    pin [V] bool. Aligned with the canonical pose of the body named by the attribute `body`.
-Motion, `format` = "clothjax/motion", attribute `fps` float64:
-    poses [T, J, 3] axis-angle in radians, local to the parent, zero is the body's canonical pose;
+Body, `format` "clothjax/body":
+    vertices [B, 3]; faces [Fb, 3] int32; joints [J, 3]; joint_names [J] strings;
+    parents [J] int32, the root first with -1, parents before their children;
+    weights_index [B, n] int16 and weights_value [B, n]: skinning weights, each row summing to 1;
+    shapedirs [B, 3, S] and joint_shapedirs [J, 3, S], per standard deviation;
+    optional posedirs [B, 3, 9 (J - 1)];
+    optional canonical_rotation [J, 3, 3], which turns each bone of the canonical pose to a T-pose.
+Garment, `format` "clothjax/garment", attribute `body`, the name of the body it is aligned with:
+    vertices [V, 3]; faces [F, 3] int32; weights_index [V, n] int16 and weights_value [V, n];
+    shapedirs [V, 3, S]; pin [V] bool, the vertices that follow skinning.
+Motion, `format` "clothjax/motion", attribute `fps` float64:
+    poses [T, J, 3], axis-angle in radians, local to the parent; zero is the body's canonical pose;
     trans [T, 3] float64, of the root relative to its canonical place; joint_names [J] strings.
 
 On reading, any `format` that ends in /body, /garment or /motion will do, and further datasets are left alone.
@@ -38,7 +40,7 @@ ASSETS = Path(__file__).parent / "assets"
 
 
 def asset(name: str | Path) -> Path:
-    """The file meant by a configuration: a path as it is, or the name of something embedded, such as "tshirt_1000".
+    """The file meant by a configuration: a path as it is, or a name of something embedded, as "tshirt_1000".
 
     Raises:
         ValueError: for a name that is neither.
@@ -98,7 +100,7 @@ def load_garment(path: str | Path, body: Body) -> Garment:
     """The garment in a file (or embedded), made for `body`.
 
     Raises:
-        ValueError: naming the file, the dataset and the first wrong entry; or if garment and body are far apart.
+        ValueError: naming the file, the dataset and the first wrong entry; or if the body is far away.
     """
     with _open(path, "garment") as file:
         sizes = {"J": len(body.parents), "S": np.shape(body.shapedirs)[-1]}
@@ -124,7 +126,7 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
 
     Args:
         path: of the file.
-        joint_names: the body's, from `joint_names(body_path)`; the motion must have the same, in the same order.
+        joint_names: the body's, from `joint_names(body_path)`; the motion must have the same, in that order.
 
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
@@ -157,7 +159,7 @@ def joint_names(path: str | Path) -> tuple[str, ...]:
 
 
 def canonical_rotation(path: str | Path) -> np.ndarray:
-    """Rotations [J, 3, 3] that turn each bone of a body's canonical pose to a T-pose; identities where not stored."""
+    """Rotations [J, 3, 3] that turn a body's bones from its canonical pose to a T-pose; identity if not stored."""
     with _open(path, "body") as file:
         names = _names(file, {})
         if "canonical_rotation" not in file:
@@ -243,7 +245,7 @@ def joint_positions(motion: Motion, body: Body) -> np.ndarray:
 
 
 def bad_frames(motion: Motion, body: Body, limit: float = 0.12) -> np.ndarray:
-    """Frames that no body could have moved through: a joint's position has too large a second difference there.
+    """Frames that no body could have moved through: a joint's position has too large a second difference.
 
     Args:
         limit: m per frame^2 at 30 fps; scaled by (30 / fps)^2 for another rate. 0.12 is 11 g.
@@ -327,7 +329,7 @@ def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) 
     twice = np.flatnonzero((a == b) | (b == c) | (c == a))
     if len(twice):
         raise ValueError(
-            f"{file.filename}: face {twice[0]} has the same vertex twice, {faces[twice[0]].tolist()}: remove it"
+            f"{file.filename}: face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it"
         )
     return faces
 
@@ -390,7 +392,7 @@ def _refuse_joints(file: h5py.File, found: tuple[str, ...], wanted: tuple[str, .
         else f"has another order, {list(found)}"
     )
     raise ValueError(
-        f"{file.filename}: joints differ from the body's: the motion {text}; retarget it onto this body (data_prep)"
+        f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)"
     )
 
 
