@@ -1,0 +1,229 @@
+"""Strict loading of frozen dataclasses from YAML files and the command line."""
+
+import dataclasses
+import difflib
+import math
+import sys
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+Config = TypeVar("Config")
+Sources = dict[str, tuple[str, ...]]  # dotted path of a value -> the files that set it or parts of it
+
+
+def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """The configuration in a YAML file, over its `extends:` parents, under command-line overrides.
+
+    Mappings are merged key by key; every other value, lists included, replaces its parent's.
+
+    Args:
+        cls: a frozen dataclass whose fields are bool, int, float, str, Literal, tuples of these, Optional,
+            `dict[str, X]` and dataclasses.
+        path: the YAML file; `extends: other.yaml` in it is relative to it.
+        overrides: such as `["--train.learning_rate", "3e-4"]`.
+
+    Raises:
+        ValueError: for a file that is missing or not YAML, a cycle of `extends:`, an unknown key, a value of
+            the wrong type and whatever `__post_init__` refuses, naming the file and the dotted path.
+        SystemExit: for a mistake in `overrides`, after printing what is wrong with them, or for `--help`.
+    """
+    values, sources = _read(Path(path), ())
+    config = _build(cls, values, "", sources, str(path))
+    return _override(cls, config, overrides, prog=f"... {path}") if overrides else config
+
+
+def cli(cls: type[Config], argv: Sequence[str]) -> Config:
+    """The configuration that a command line asks for: a YAML file, then overrides such as `--train.seed 3`.
+
+    Args:
+        argv: the arguments, without the program's name. `--help` alone lists every setting with its default.
+    """
+    if argv and not argv[0].startswith("-"):
+        try:
+            return load(cls, argv[0], argv[1:])
+        except ValueError as error:
+            sys.exit(str(error))
+    usage = "CONFIG.yaml [--SETTING VALUE ...]"
+    if {"-h", "--help"} & set(argv):
+        return _override(cls, cls(), ["--help"], prog=usage)
+    sys.exit(f"the first argument must be a configuration file: {usage}; `--help` lists the settings")
+
+
+def to_dict(config: Any) -> Any:
+    """The configuration as plain dictionaries and lists, for JSON and YAML."""
+    if dataclasses.is_dataclass(config):
+        return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, Mapping):
+        return {key: to_dict(value) for key, value in config.items()}
+    if isinstance(config, tuple | list):
+        return [to_dict(value) for value in config]
+    return config
+
+
+def from_dict(cls: type[Config], values: Mapping[str, Any], source: str = "configuration") -> Config:
+    """The inverse of `to_dict`; keys left out take their defaults.
+
+    Args:
+        source: what to call `values` in messages, such as the file they came from.
+
+    Raises:
+        ValueError: as `load`.
+    """
+    return _build(cls, values, "", {}, source)
+
+
+def _override(cls: type[Config], config: Config, arguments: Sequence[str], prog: str) -> Config:
+    import tyro
+
+    return tyro.cli(cls, default=config, args=list(arguments), prog=prog)
+
+
+def _read(path: Path, children: tuple[Path, ...]) -> tuple[dict, Sources]:
+    """The values of a file over those of its parents, and which file each came from."""
+    if path.resolve() in children:
+        chain = " -> ".join(str(p) for p in (*children, path.resolve()))
+        raise ValueError(f"{path}: `extends:` goes round in a circle: {chain}")
+    try:
+        text = path.read_text(encoding="utf-8")
+        _refuse_duplicates(yaml.compose(text, Loader=yaml.SafeLoader), path)
+        values = yaml.safe_load(text)
+    except OSError as error:
+        child = f" (extended by {children[-1]})" if children else ""
+        raise ValueError(f"{path}{child}: cannot be read: {error.strerror or error}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: is not valid YAML: {error}") from error
+    values = {} if values is None else values
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected `key: value` lines at the top, got {values!r}")
+    parent = values.pop("extends", None)
+    if parent is None:
+        return _merge({}, values, "", {}, str(path))
+    if not isinstance(parent, str):
+        raise ValueError(f"{path}: extends: expected the name of one file, got {parent!r}")
+    inherited, sources = _read(path.parent / parent, (*children, path.resolve()))
+    return _merge(inherited, values, "", sources, str(path))
+
+
+def _refuse_duplicates(node: yaml.Node | None, path: Path) -> None:
+    """PyYAML lets the last of two equal keys win, in silence."""
+    if isinstance(node, yaml.SequenceNode):
+        for child in node.value:
+            _refuse_duplicates(child, path)
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, child in node.value:
+            if key.value in seen:
+                raise ValueError(f"{path}, line {key.start_mark.line + 1}: {key.value!r} is set twice")
+            seen.add(key.value)
+            _refuse_duplicates(child, path)
+
+
+def _merge(old: dict, new: dict, prefix: str, sources: Sources, source: str) -> tuple[dict, Sources]:
+    merged = dict(old)
+    for key, value in new.items():
+        path = _join(prefix, key)
+        inherited = merged.get(key)
+        if isinstance(value, dict):
+            shared = isinstance(inherited, dict)
+            sources = sources | {path: (*(sources.get(path, ()) if shared else ()), source)}
+            merged[key], sources = _merge(inherited if shared else {}, value, path, sources, source)
+        else:
+            merged[key], sources = value, sources | {path: (source,)}
+    return merged, sources
+
+
+def _join(prefix: str, key: Any) -> str:
+    return f"{prefix}.{key}" if prefix else str(key)
+
+
+def _fail(message: str, path: str, sources: Sources, default: str) -> typing.NoReturn:
+    """Raises, naming the dotted path and the files that set the value there."""
+    known = path.partition("[")[0]  # an element of a list comes from where the list does
+    while known and known not in sources:
+        known = known.rpartition(".")[0]
+    where = ", ".join(sources.get(known, (default,)))
+    raise ValueError(f"{where}: {path}: {message}" if path else f"{where}: {message}")
+
+
+def _build(cls: type, values: Any, path: str, sources: Sources, default: str) -> Any:
+    """The dataclass `cls` from the mapping found at `path`."""
+    if not isinstance(values, Mapping):
+        _fail(f"expected a mapping of settings, got {values!r}", path, sources, default)
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    for key in values:
+        if key not in fields:
+            near = difflib.get_close_matches(str(key), fields, 1)
+            hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(fields))}"
+            _fail(f"unknown key; {hint}", _join(path, key), sources, default)
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in values:
+            _fail("is required and missing", _join(path, name), sources, default)
+    hints = typing.get_type_hints(cls)
+    arguments = {key: _coerce(hints[key], v, _join(path, key), sources, default) for key, v in values.items()}
+    try:
+        return cls(**arguments)
+    except ValueError as error:  # of __post_init__: these keys belong together, so the whole mapping is named
+        _fail(str(error), path, sources, default)
+
+
+def _coerce(hint: Any, value: Any, path: str, sources: Sources, default: str) -> Any:
+    """`value` as the declared type, or a ValueError."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, path, sources, default)
+    if origin in (typing.Union, types.UnionType):
+        (inner,) = (a for a in arguments if a is not type(None))  # Optional is the only union we declare
+        return None if value is None else _coerce(inner, value, path, sources, default)
+    if origin is typing.Literal:
+        if not any(value == a and type(value) is type(a) for a in arguments):
+            _fail(f"{value!r} is not one of {', '.join(map(repr, arguments))}", path, sources, default)
+        return value
+    if origin is tuple:
+        return _coerce_tuple(arguments, value, path, sources, default)
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            _fail(f"expected a mapping, got {value!r}", path, sources, default)
+        return {str(k): _coerce(arguments[1], v, _join(path, k), sources, default) for k, v in value.items()}
+    scalar = _scalar(hint, value)
+    if scalar is None:
+        hint_text = "; put text in quotes" if hint is str else ""
+        _fail(
+            f"expected {hint.__name__}, got {value!r} ({type(value).__name__}){hint_text}",
+            path,
+            sources,
+            default,
+        )
+    return scalar
+
+
+def _coerce_tuple(arguments: tuple, value: Any, path: str, sources: Sources, default: str) -> tuple:
+    if not isinstance(value, list | tuple):
+        _fail(f"expected a list, got {value!r}", path, sources, default)
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        arguments = (arguments[0],) * len(value)
+    if len(arguments) != len(value):
+        _fail(f"expected {len(arguments)} values, got {len(value)}: {value!r}", path, sources, default)
+    return tuple(
+        _coerce(a, v, f"{path}[{i}]", sources, default) for i, (a, v) in enumerate(zip(arguments, value))
+    )
+
+
+def _scalar(kind: type, value: Any) -> bool | int | float | str | None:
+    """`value` as a bool, int, float or str; None where it is not one."""
+    if kind in (bool, str) or isinstance(value, bool):
+        return value if isinstance(value, kind) and isinstance(value, bool) == (kind is bool) else None
+    try:
+        number = float(value)  # YAML 1.1, and so PyYAML, reads 1e-4 as text
+    except (TypeError, ValueError):
+        return None
+    if kind is float:
+        return None if math.isnan(number) else number
+    if isinstance(value, int):
+        return value
+    return int(number) if number.is_integer() else None
