@@ -1,4 +1,4 @@
-"""Coarser graphs of a mesh: HOOD's edge levels and Zhou et al.'s hierarchy for mesh convolution. NumPy only."""
+"""Coarser graphs of a mesh: HOOD's edge levels and the mesh-convolution tables of Zhou et al. NumPy only."""
 
 from collections import deque
 from collections.abc import Sequence

@@ -15,8 +15,8 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
         vertex_count: V, by default the highest index plus one.
 
     Returns:
-        Mesh with hinges [H, 4] sorted by edge: (a, b) as directed in the left face, the first in `faces`, and
-        the vertices opposite it in the left and in the right face. Where three or more faces share an edge the
+        Mesh with hinges [H, 4] sorted by edge: (a, b) as directed in the left face, the first in `faces`; the
+        vertices opposite it in the left and in the right face. Of three or more faces that share an edge the
         first two make the hinge, as in HOOD (Grigorev et al. 2023).
 
     Raises:
