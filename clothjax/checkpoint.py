@@ -1,0 +1,257 @@
+"""Checkpoints of a training state: atomic, every leaf checked, readable in parts. The only user of Orbax.
+
+A checkpoint is the folder `<directory>/<step>`: `state`, the leaves by name (`params/decoder/w`), and `about`,
+a JSON with the configuration and each leaf's shape, dtype and checksum. Orbax writes under a temporary name and
+renames at the end, so a process killed at any moment leaves the checkpoint before it.
+"""
+
+import shutil
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+FORMAT = 1
+"""Of what is written; readers refuse a newer one."""
+
+Tree = TypeVar("Tree")
+T = TypeVar("T")
+
+
+class Checkpoint(NamedTuple):
+    """What a checkpoint says about itself."""
+
+    path: Path
+    step: int
+    config: dict
+    description: str
+    leaves: dict[str, dict]  # name -> its "shape", "dtype", "checksum" and, for random keys, "key"
+
+
+class _Damaged(Exception):
+    """The files of a checkpoint are not what was written."""
+
+
+def save(
+    directory: str | Path, step: int, state: Any, config: dict, description: str = "", *, keep: int = 3
+) -> None:
+    """Writes a checkpoint, then removes all but the newest `keep`. Each process of a run calls it.
+
+    Args:
+        directory: of all checkpoints of a run; made if it is not there.
+        step: training steps taken.
+        state: any pytree of arrays; typed random keys may be among them.
+        config: the run's configuration, as `configuration.to_dict` gives it.
+        description: one line for a person.
+
+    Raises:
+        ValueError: if there is already a checkpoint of this step or a later one.
+    """
+    directory = Path(directory).resolve()
+    existing = steps(directory)
+    if existing and existing[-1] >= step:
+        raise ValueError(
+            f"{directory}: cannot save step {step}, there is already a checkpoint of step {existing[-1]}"
+        )
+    named = {name: jnp.asarray(leaf) for name, leaf in _named(state).items()}
+    about = {
+        "format": FORMAT,
+        "step": step,
+        "config": config,
+        "description": description,
+        "leaves": {name: _describe(leaf) for name, leaf in named.items()},
+    }
+    arrays = {
+        name: _plain(leaf) for name, leaf in named.items() if leaf.size
+    }  # Orbax cannot store empty arrays
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
+    )
+    with ocp.CheckpointManager(directory, options=options) as manager:
+        manager.save(
+            step, args=ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about))
+        )
+
+
+def steps(directory: str | Path) -> list[int]:
+    """The steps of the complete checkpoints in a directory, ascending; empty where there are none."""
+    directory = Path(directory)
+    if not directory.is_dir():
+        return []
+    return sorted(
+        int(entry.name) for entry in directory.iterdir() if entry.name.isdecimal() and entry.is_dir()
+    )
+
+
+def latest(directory: str | Path) -> Checkpoint:
+    """What the newest checkpoint says about itself.
+
+    Raises:
+        ValueError: if there is none, or a newer version of this library wrote it.
+    """
+    return _newest(Path(directory).resolve(), None, _about)
+
+
+def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
+    """The whole state of the newest undamaged checkpoint, bit for bit; warns of damaged ones passed over.
+
+    Args:
+        like: a state of the wanted structure, shapes, dtypes and sharding: arrays or `jax.ShapeDtypeStruct`s.
+        step: of one checkpoint, instead of the newest.
+
+    Raises:
+        ValueError: if there is no undamaged checkpoint, or a leaf is missing, left over or of another shape.
+    """
+    return _restore(Path(directory).resolve(), like, step, whole=True)
+
+
+def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
+    """As `restore`, but only the parts of the state that `like` names.
+
+    Args:
+        like: a dictionary from some of the state's keys or fields to trees as in `restore`, such as
+            `{"params": ..., "statistics": ...}`.
+
+    Raises:
+        ValueError: if there is no undamaged checkpoint, or a leaf is missing or of another shape.
+    """
+    return _restore(Path(directory).resolve(), like, step, whole=False)
+
+
+def set_aside(directory: str | Path, after: int) -> None:
+    """Renames later checkpoints to `<step>.damaged`, so that a run resumed before them can save again."""
+    directory = Path(directory)
+    for step in steps(directory):
+        if step > after:
+            aside = directory / f"{step}.damaged"
+            shutil.rmtree(aside, ignore_errors=True)
+            (directory / str(step)).rename(aside)
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    """Leaves by path. Dictionary keys and fields of a NamedTuple look alike: parts of either can be named."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    assert len(named) == len(leaves), "two leaves of the state have the same path"
+    return named
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _plain(leaf: jax.Array) -> jax.Array:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _describe(leaf: jax.Array) -> dict:
+    description = {"shape": list(leaf.shape), "dtype": str(leaf.dtype), "checksum": _checksum(_plain(leaf))}
+    return description | ({"key": str(jax.random.key_impl(leaf))} if _is_key(leaf) else {})
+
+
+def _checksum(array: jax.Array) -> int | None:
+    """CRC-32 of the bytes (Orbax misses a flipped bit), or None for an array spread over processes."""
+    if not (array.is_fully_addressable or array.is_fully_replicated):
+        return None
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+
+
+def _newest(directory: Path, step: int | None, read: Callable[[Path], T]) -> T:
+    """`read` of the newest checkpoint that is not damaged."""
+    existing = steps(directory)
+    if not existing:
+        why = "holds no checkpoints (folders named by a step)" if directory.is_dir() else "does not exist"
+        raise ValueError(f"{directory}: {why}; train first, or give the folder of another run")
+    if step is not None and step not in existing:
+        raise ValueError(f"{directory}: no checkpoint of step {step}; there are {existing}")
+    for number in reversed(existing if step is None else [step]):
+        try:
+            return read(directory / str(number))
+        except _Damaged as damage:
+            reason = f"{directory / str(number)} is damaged ({damage})"
+            warnings.warn(f"{reason}; looking for an older checkpoint", stacklevel=4)
+    raise ValueError(f"{directory}: no undamaged checkpoint: {reason}")
+
+
+def _about(path: Path) -> Checkpoint:
+    try:
+        with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
+            about = reader.restore(path / "about")
+        version = about["format"]
+        checkpoint = Checkpoint(path, about["step"], about["config"], about["description"], about["leaves"])
+    except Exception as error:  # whatever Orbax makes of broken files: the reason is kept in the message
+        raise _Damaged(f"its description cannot be read: {_first_line(error)}") from error
+    if version > FORMAT:
+        raise ValueError(
+            f"{path}: has format {version}, this version of clothjax reads up to {FORMAT}; update it"
+        )
+    return checkpoint
+
+
+def _restore(directory: Path, like: Tree, step: int | None, *, whole: bool) -> tuple[Tree, Checkpoint]:
+    wanted = _named(like)
+
+    def read(path: Path) -> tuple[Tree, Checkpoint]:
+        checkpoint = _about(path)
+        _check(checkpoint, wanted, whole)
+        leaves = _leaves(checkpoint, wanted)
+        return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in wanted]), checkpoint
+
+    return _newest(directory, step, read)
+
+
+def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
+    """Raises where names, shapes or dtypes differ. Orbax's partial restore accepts all of it in silence."""
+    hint = "another garment, other model sizes or another version of the model"
+    for name, leaf in wanted.items():
+        stored = checkpoint.leaves.get(name)
+        if stored is None:
+            raise ValueError(f"{checkpoint.path}: has no {name}, which this model needs: {hint}")
+        if tuple(stored["shape"]) != tuple(leaf.shape) or stored["dtype"] != str(leaf.dtype):
+            raise ValueError(
+                f"{checkpoint.path}: {name} is {stored['dtype']}{stored['shape']}, "
+                f"this model needs {leaf.dtype}{list(leaf.shape)}: {hint}"
+            )
+    left_over = sorted(set(checkpoint.leaves) - set(wanted)) if whole else []
+    if left_over:
+        raise ValueError(
+            f"{checkpoint.path}: holds {', '.join(left_over[:5])}, which this model has not: {hint}"
+        )
+
+
+def _leaves(checkpoint: Checkpoint, wanted: dict[str, Any]) -> dict[str, jax.Array]:
+    """The wanted leaves, which the checkpoint has, checked against what was written."""
+    default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    abstract = {}
+    for name, leaf in wanted.items():
+        plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+        sharding = getattr(leaf, "sharding", None) or default
+        abstract[name] = jax.ShapeDtypeStruct(plain.shape, plain.dtype, sharding=sharding)
+    stored = {name: leaf for name, leaf in abstract.items() if leaf.size}
+    arguments = ocp.args.PyTreeRestore(
+        item=stored, restore_args=ocp.checkpoint_utils.construct_restore_args(stored), partial_restore=True
+    )
+    try:
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as reader:
+            arrays = reader.restore(checkpoint.path / "state", args=arguments)
+    except Exception as error:  # as in _about
+        raise _Damaged(_first_line(error)) from error
+    leaves = {}
+    for name, leaf in abstract.items():
+        array = arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
+        description = checkpoint.leaves[name]
+        if not isinstance(array, jax.Array) or description["checksum"] not in (None, _checksum(array)):
+            raise _Damaged(f"{name} is not as it was written")
+        key = description.get("key")
+        leaves[name] = jax.random.wrap_key_data(array, impl=key) if key else array
+    return leaves
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
