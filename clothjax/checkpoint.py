@@ -1,8 +1,8 @@
 """Checkpoints of a training state: atomic, every leaf checked, readable in parts. The only user of Orbax.
 
-A checkpoint is the folder `<directory>/<step>`: `state`, the leaves by name (`params/decoder/w`), and `about`,
-a JSON with the configuration and each leaf's shape, dtype and checksum. Orbax writes under a temporary name and
-renames at the end, so a process killed at any moment leaves the checkpoint before it.
+A checkpoint is the folder `DIRECTORY/STEP`: `state`, the leaves by name (`params/decoder/w`), and `about`, a
+JSON with the configuration and the shape, dtype and checksum of each leaf. Orbax writes under a temporary
+name and renames at the end, so a process killed at any moment leaves the checkpoint before it.
 """
 
 import shutil
