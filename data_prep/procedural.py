@@ -16,8 +16,9 @@ import tyro
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import canonical_rotation, joint_names, joint_positions, load_body, save_motion
-from clothjax.types import Body, Motion
+from clothjax.storage import canonical_rotation, joint_names, load_body, save_motion
+from clothjax.types import Motion
+from data_prep.retarget import cmu_names, stand
 
 # cycles per second, before a seed's own factor
 RATES = {"walk": 0.9, "run": 1.35, "jump": 0.5, "arms": 0.35, "twist": 0.4, "dance": 0.8}
@@ -27,27 +28,6 @@ SMOOTHING = {"run": 0.06, "jump": 0.08}
 ARMS_DOWN = 75.0  # degrees from the T-pose, at rest
 EASE_IN = 0.8  # s
 
-# joints driven, by their names on CMU's skeleton (the embedded body) and on SMPL
-SMPL_NAMES = {
-    "Hips": "pelvis",
-    "LowerBack": "spine1",
-    "Spine": "spine2",
-    "Spine1": "spine3",
-    "Neck": "neck",
-    "Head": "head",
-    "LeftShoulder": "left_collar",
-    "LeftArm": "left_shoulder",
-    "LeftForeArm": "left_elbow",
-    "LeftUpLeg": "left_hip",
-    "LeftLeg": "left_knee",
-    "LeftFoot": "left_ankle",
-    "RightShoulder": "right_collar",
-    "RightArm": "right_shoulder",
-    "RightForeArm": "right_elbow",
-    "RightUpLeg": "right_hip",
-    "RightLeg": "right_knee",
-    "RightFoot": "right_ankle",
-}
 SIDES = ((1, "Left"), (-1, "Right"))
 
 
@@ -111,23 +91,7 @@ def generate(
     rotations[:, 1:] = np.swapaxes(turned[:, body.parents[1:]], -1, -2) @ turned[:, 1:]
 
     motion = Motion(rotations.astype(np.float32), pattern.root - body.joints[0], fps)
-    floor = np.percentile(lowest_point(motion, body), 2)
-    path = np.float32(motion.translation - [0, floor, 0])  # the digits below are noise that does not compress
-    return motion._replace(translation=path.astype(np.float64))
-
-
-def lowest_point(motion: Motion, body: Body) -> np.ndarray:
-    """Height [T] in metres of the lowest vertex of the skinned body (betas 0)."""
-    turned = np.array(motion.rotations, np.float64)
-    for j, parent in enumerate(body.parents):
-        if parent >= 0:
-            turned[:, j] = turned[:, parent] @ turned[:, j]
-    shift = joint_positions(motion, body) - np.einsum("tjab,jb->tja", turned, body.joints)
-    rows = np.concatenate(
-        [turned[:, :, 1], shift[:, :, 1:2]], axis=-1
-    )  # the part of each transform that gives y
-    points = np.concatenate([body.vertices, np.ones((len(body.vertices), 1))], axis=1)
-    return np.array([np.einsum("vk,vk->v", body.weights @ row, points).min() for row in rows])
+    return stand(motion, body)
 
 
 def _pattern(kind: str, seed: int, seconds: float, fps: float) -> Pattern:
@@ -250,12 +214,11 @@ def _matrices(degrees: np.ndarray) -> np.ndarray:
 
 
 def _find(names: tuple[str, ...], joint: str) -> int:
-    for name in (joint, SMPL_NAMES[joint]):
-        if name in names:
-            return names.index(name)
-    raise ValueError(
-        f"the body has no joint {joint!r} or {SMPL_NAMES[joint]!r}, only {', '.join(names)}: rename it"
-    )
+    if joint not in cmu_names(names):
+        raise ValueError(
+            f"the body has no joint {joint!r} (CMU) or SMPL's for it, only {', '.join(names)}: rename it"
+        )
+    return cmu_names(names).index(joint)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,332 @@
+"""Making data: generated motions, readers of motion capture, retargeting, the body and the garments."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from clothjax import storage
+from data_prep import asf_amc, bvh, procedural, retarget
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="needs the recordings in ../shared/data")
+
+
+@pytest.fixture(scope="module")
+def body():
+    return storage.load_body("body")
+
+
+@pytest.fixture(scope="module")
+def names():
+    return storage.joint_names("body")
+
+
+# Generated motions
+
+
+@pytest.mark.parametrize("kind", procedural.KINDS)
+def test_generated_motion_is_possible_and_stands_on_the_floor(kind, body):
+    for seed in (0, 5):
+        motion = procedural.generate(kind, seed, seconds=4.0)
+        assert motion.rotations.shape == (121, 31, 3, 3)
+        product = motion.rotations @ np.swapaxes(motion.rotations, -1, -2)
+        np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
+        assert storage.bad_frames(motion, body, limit=0.115).size == 0
+        toes = storage.joint_positions(motion, body)[..., 1].min(axis=1)
+        assert -0.02 < np.percentile(toes, 10) < 0.09  # the toe joint is a few cm within the foot
+
+
+@needs_shared
+@pytest.mark.parametrize("kind", procedural.KINDS)
+def test_generated_motion_is_the_earlier_one(kind, body, names):
+    """The poses and path of the files the first experiments used, but for the height of the floor (1 cm).
+
+    Run and jump are rounder: the root stays within 15 cm and the median joint within 3 cm.
+    """
+    found = procedural.generate(kind, 1)
+    wanted = storage.load_motion(SHARED / f"motion/proc_{kind}_1.motion.h5", names)
+    shift = storage.joint_positions(found, body) - storage.joint_positions(wanted, body)
+    assert np.median(np.linalg.norm(shift, axis=-1)) < 0.03
+    if kind in procedural.SMOOTHING:
+        assert np.abs(shift[:, 0]).max() < 0.15
+    else:
+        assert np.abs(shift).max() < 0.01
+        np.testing.assert_allclose(found.rotations, wanted.rotations, atol=1e-5)
+
+
+def test_embedded_clips_are_what_the_generator_makes(names):
+    found, wanted = procedural.generate("run", 3), storage.load_motion("run_3", names)
+    np.testing.assert_allclose(found.rotations, wanted.rotations, atol=1e-5)
+    np.testing.assert_allclose(found.translation, wanted.translation, atol=1e-5)
+
+
+def test_generated_motion_at_another_rate(body):
+    """Twice the frames of the same motion, smoothing included."""
+    slow, fast = procedural.generate("jump", 2, 4.0, 30.0), procedural.generate("jump", 2, 4.0, 60.0)
+    assert len(fast.translation) == 2 * len(slow.translation) - 1
+    distance = storage.joint_positions(fast, body)[::2] - storage.joint_positions(slow, body)
+    assert np.abs(distance).max() < 0.01
+
+
+def test_generator_refuses():
+    with pytest.raises(ValueError, match="walk, run"):
+        procedural.generate("swim")
+    with pytest.raises(ValueError, match="three frames"):
+        procedural.generate("walk", seconds=0.01)
+
+
+def test_generator_command(tmp_path, names):
+    procedural.main(procedural.Arguments(tmp_path, kinds=("twist",), seeds=(7,), seconds=1.0))
+    motion = storage.load_motion(tmp_path / "twist_7.h5", names)
+    np.testing.assert_allclose(motion.rotations, procedural.generate("twist", 7, 1.0).rotations, atol=1e-5)
+
+
+# Readers: a root, a leg of two bones, a foot
+
+ASF = """# comment
+:version 1.10
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:root
+   order TX TY TZ RX RY RZ
+   axis XYZ
+   position 0 0 0
+:bonedata
+  begin
+     name lfemur
+     direction 0 -1 0
+     length 2
+     axis 0 0 90 XYZ
+    dof rx rz
+    limits (-1 1)
+           (-1 1)
+  end
+  begin
+     name ltibia
+     direction 0 -1 0
+     length 3
+     axis 0 0 0 XYZ
+    dof rx
+  end
+  begin
+     name lfoot
+     direction 0 0 1
+     length 1
+     axis 0 0 0 XYZ
+  end
+:hierarchy
+  begin
+    root lfemur
+    lfemur ltibia
+    ltibia lfoot
+  end
+"""
+AMC = """#!OML:ASF
+:FULLY-SPECIFIED
+:DEGREES
+1
+root 1 2 3 0 0 0
+lfemur 0 0
+ltibia 0
+2
+root 2 2 3 10 20 30
+lfemur 90 0
+ltibia 45
+"""
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
+  JOINT mixamorig:LeftUpLeg
+  {
+    OFFSET 0 0 0
+    CHANNELS 3 Zrotation Yrotation Xrotation
+    JOINT lShin
+    {
+      OFFSET 0 -2 0
+      CHANNELS 3 Zrotation Yrotation Xrotation
+      JOINT LeftFoot
+      {
+        OFFSET 0 -3 0
+        CHANNELS 3 Zrotation Yrotation Xrotation
+        End Site
+        {
+          OFFSET 0 0 1
+        }
+      }
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0083333
+1 2 3 0 0 0 0 0 0 0 0 0 0 0 0
+2 2 3 30 20 10 0 90 0 0 0 45 0 0 0
+"""
+CHAIN = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot")
+
+
+def _write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_asf_and_amc(tmp_path):
+    skeleton = asf_amc.read_asf(_write(tmp_path / "a.asf", ASF))
+    capture = asf_amc.read_amc(_write(tmp_path / "a.amc", AMC), skeleton)
+    assert capture.names == CHAIN and capture.parents.tolist() == [-1, 0, 1, 2] and capture.fps == 120
+    np.testing.assert_allclose(capture.offsets, [[0, 0, 0], [0, 0, 0], [0, -2, 0], [0, -3, 0]], atol=1e-12)
+    np.testing.assert_allclose(capture.translation, [[1, 2, 3], [2, 2, 3]])
+    np.testing.assert_allclose(capture.rotations[0], np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
+    # x first, then y, then z, about fixed axes
+    x, y, z = (Rotation.from_rotvec(np.radians(d) * v) for d, v in zip((10, 20, 30), np.eye(3)))
+    np.testing.assert_allclose(capture.rotations[1, 0], (z * y * x).as_matrix(), atol=1e-12)
+    # the thigh's x axis is turned by 90 degrees about z: its rx is about +y
+    expected = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    np.testing.assert_allclose(capture.rotations[1, 1], expected, atol=1e-12)
+    np.testing.assert_allclose(capture.rotations[1, 3], np.eye(3))
+
+
+def test_bvh_agrees_with_asf_and_amc(tmp_path):
+    skeleton = asf_amc.read_asf(_write(tmp_path / "a.asf", ASF))
+    wanted = asf_amc.read_amc(_write(tmp_path / "a.amc", AMC), skeleton)
+    found = bvh.read_bvh(_write(tmp_path / "a.bvh", BVH))
+    assert found.names == CHAIN and found.parents.tolist() == [-1, 0, 1, 2] and found.fps == 120
+    for name in ("offsets", "rotations", "translation"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("length 2", "length two", ["line 15", "two"]),
+        ("direction 0 -1 0\n     length 3", "direction 0 -1\n     length 3", ["line 23", "expected 3"]),
+        ("dof rx rz", "dof rx l", ["line 17", "rx l"]),
+        ("     name ltibia\n", "", ["line 26", "name"]),
+        ("ltibia lfoot", "ltibia rfoot", ["line 38", "rfoot"]),
+        ("    ltibia lfoot\n", "", ["lfoot"]),
+    ],
+)
+def test_malformed_asf_names_its_line(tmp_path, old, new, words):
+    path = _write(tmp_path / "a.asf", ASF.replace(old, new))
+    assert ASF.count(old) == 1
+    with pytest.raises(ValueError) as error:
+        asf_amc.read_asf(path)
+    for word in ["a.asf", *words]:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("lfemur 90 0", "lfemur 90", ["line 10", "expected 2"]),
+        ("lfemur 90 0", "lfemur 90 x", ["line 10", "'x'"]),
+        ("lfemur 90 0", "lfemur 90 nan", ["line 10", "finite"]),
+        ("lfemur 90 0", "rfemur 90 0", ["line 10", "rfemur"]),
+        ("lfemur 90 0", "ltibia 1", ["line 11", "twice"]),
+        ("lfemur 0 0\n", "", ["line 7", "lacks lfemur"]),
+        ("ltibia 45\n", "", ["line 10", "lacks ltibia"]),
+        (AMC, ":DEGREES\n", ["no frames"]),
+    ],
+)
+def test_malformed_amc_names_its_line(tmp_path, old, new, words):
+    skeleton = asf_amc.read_asf(_write(tmp_path / "a.asf", ASF))
+    path = _write(tmp_path / "a.amc", AMC.replace(old, new))
+    with pytest.raises(ValueError) as error:
+        asf_amc.read_amc(path, skeleton)
+    for word in ["a.amc", *words]:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("OFFSET 0 -2 0", "OFFSET 0 -2", ["line 12", "expected 3"]),
+        ("CHANNELS 6 Xposition", "CHANNELS 6 Wposition", ["line 5", "Wposition"]),
+        ("Frames: 2", "Frames: 3", ["3 announced"]),
+        ("Frame Time: 0.0083333", "Frame Time: 0", ["line 28", "> 0"]),
+        ("30 20 10", "30 20", ["line 30", "expected 15"]),
+        ("  }\n}\nMOTION", "  }\nMOTION", ["line 25", "complete"]),
+        (BVH[BVH.index("MOTION") :], "", ["no MOTION"]),
+        ("JOINT lShin", "JOIN lShin", ["line 10", "JOIN"]),
+    ],
+)
+def test_malformed_bvh_names_its_line(tmp_path, old, new, words):
+    assert BVH.count(old) == 1
+    path = _write(tmp_path / "a.bvh", BVH.replace(old, new))
+    with pytest.raises(ValueError) as error:
+        bvh.read_bvh(path)
+    for word in ["a.bvh", *words]:
+        assert word in str(error.value)
+
+
+def test_missing_and_cut_recordings(tmp_path):
+    with pytest.raises(ValueError, match=r"none\.bvh"):
+        bvh.read_bvh(tmp_path / "none.bvh")
+    (tmp_path / "a.asf.gz").write_bytes(b"\x1f\x8b\x08\x00")
+    with pytest.raises(ValueError, match=r"a\.asf\.gz"):
+        asf_amc.read_asf(tmp_path / "a.asf.gz")
+
+
+# Retargeting
+
+
+def test_resampling():
+    """A joint that turns steadily does so at any rate, also past half a turn."""
+    times = np.arange(25) / 24
+    turning = Rotation.from_rotvec(np.outer(times, [0, 5.0, 0])).as_matrix()[:, None]
+    path = np.outer(times, [1.0, 2, 3])
+    capture = retarget.Capture(("Hips",), np.array([-1]), np.zeros((1, 3)), turning, path, 24.0)
+    found = retarget.resample(capture, 30.0)
+    assert len(found.rotations) == 31
+    expected = Rotation.from_rotvec(np.outer(np.arange(31) / 30, [0, 5.0, 0])).as_matrix()
+    np.testing.assert_allclose(found.rotations[:, 0], expected, atol=1e-9)
+    np.testing.assert_allclose(found.translation, np.outer(np.arange(31) / 30, [1.0, 2, 3]), atol=1e-12)
+    np.testing.assert_array_equal(retarget.resample(capture, 12.0).translation, path[::2])
+    with pytest.raises(ValueError, match="two at least"):
+        retarget.resample(capture._replace(rotations=turning[:1], translation=path[:1]), 30.0)
+
+
+def test_retarget_onto_itself_and_freeze(body, names):
+    """The body's own motion as a recording twice as large comes back, but for the hands and toes."""
+    motion = procedural.generate("dance", 1, 2.0)
+    offsets = 2 * (body.joints - body.joints[np.maximum(body.parents, 0)])
+    twist = Rotation.from_euler("x", 50, degrees=True).as_matrix()
+    recorded = motion.rotations.astype(np.float64)
+    recorded[:, names.index("LeftHand")] = recorded[:, names.index("LeftHand")] @ twist
+    capture = retarget.Capture(names, body.parents, offsets, recorded, 2 * motion.translation, 30.0)
+    free = retarget.retarget(capture, body, names, freeze=False)
+    np.testing.assert_allclose(free.rotations, recorded, atol=1e-6)
+    np.testing.assert_allclose(free.translation, motion.translation, atol=0.02)
+    frozen = retarget.retarget(capture, body, names)
+    still = [i for i, n in enumerate(names) if any(part in n for part in retarget.FROZEN)]
+    others = [i for i in range(31) if i not in still]
+    np.testing.assert_allclose(frozen.rotations[:, others], recorded[:, others], atol=1e-6)
+    np.testing.assert_allclose(
+        frozen.rotations[:, still][0], np.tile(np.eye(3), (len(still), 1, 1)), atol=1e-6
+    )
+
+
+def test_retarget_refuses_another_skeleton(body, names, tmp_path):
+    capture = bvh.read_bvh(_write(tmp_path / "a.bvh", BVH))
+    unknown = capture._replace(names=("Hips", "LeftUpLeg", "knee", "LeftFoot"))
+    with pytest.raises(ValueError, match=r"LeftLeg.*rename"):
+        retarget.retarget(unknown, body, names)
+
+
+@needs_shared
+def test_cmu_recording(tmp_path, body, names):
+    """Take 02_01 gives the joints of the earlier import within 10 um, but for the floor (1 cm)."""
+    raw = SHARED / "raw"
+    out = tmp_path / "out.h5"
+    asf_amc.main(asf_amc.Arguments(raw / "02.asf.gz", raw / "02_01.amc.gz", out, freeze=False))
+    found = storage.load_motion(out, names)
+    wanted = storage.load_motion(SHARED / "motion/cmu_02_01.motion.h5", names)
+    shift = storage.joint_positions(found, body) - storage.joint_positions(wanted, body)
+    assert np.abs(shift).max() < 0.01
+    assert np.abs(shift - shift[:1, :1]).max() < 1e-5
