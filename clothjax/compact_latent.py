@@ -1,10 +1,12 @@
 """Phi: Encode, Process, Convolve, Decode (18). From a garment's state to the latent code of its next frame."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
 from clothjax import features as feature
-from clothjax import garment_model, graph_network, mesh_convolution
+from clothjax import garment_model, graph_network, mesh_convolution, skinning
 from clothjax.character import Character, Window
 from clothjax.config import MaterialConfig, ModelConfig
 from clothjax.features import Features, Statistics
@@ -39,13 +41,15 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
         )
         channels = level.features
     left, per_vertex = latent_size(scene, config)
-    return {
+    size = left * per_vertex
+    params = {"descent": jnp.zeros((size, size))} if config.latent_update == "descent" else {}
+    return params | {
         "type_embedding": jax.random.normal(keys[4], (4, TYPE_EMBEDDING)),
         "level_embedding": jax.random.normal(keys[5], (8, LEVEL_EMBEDDING)),
         "encoder": encoder,
         "processor": graph_network.init_processor(keys[6], config.processor, width, config.mlp_layers),
         "convolution": convolution,
-        "latent": init_dense(keys[7], channels, per_vertex, gain=1.0),
+        "latent": init_dense(keys[7], channels, per_vertex, gain=1e-4 if config.latent_update == "descent" else 1.0),
         "garment": garment_model.init(jax.random.fold_in(key, 9), left * per_vertex, basis, config),
     }
 
@@ -53,6 +57,7 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
 def init_statistics(example: Features) -> dict[str, Statistics]:
     """Empty statistics for features like `example`."""
     columns = {"nodes": example.nodes, "mesh": next(iter(example.edges.values())), "world": example.to_garment}
+    columns |= {"force": example.force_size}
     return {name: feature.empty_statistics(rows.shape[-1]) for name, rows in columns.items()}
 
 
@@ -66,6 +71,7 @@ def observe(statistics: dict[str, Statistics], seen: Features, limit: int) -> di
         "nodes": feature.observe(statistics["nodes"], rows(seen.nodes, seen.body), limit),
         "mesh": feature.observe(statistics["mesh"], rows(*seen.edges.values()), limit),
         "world": feature.observe(statistics["world"], rows(seen.to_garment, seen.to_body), limit),
+        "force": feature.observe(statistics["force"], rows(seen.force_size), limit),
     }
 
 
@@ -74,10 +80,9 @@ def encode(
     statistics: dict[str, Statistics],
     scene: Scene,
     seen: Features,
-    latent: Array,
     config: ModelConfig,
 ) -> Array:
-    """Encode, Process, Convolve: the latent code [L] of the next frame from features and the current code [L]."""
+    """Encode, Process, Convolve: a latent code [L] from features."""
     encoder = params["encoder"]
     pinned = scene.garment.pinned.astype(jnp.int32)
     kinds = params["type_embedding"]
@@ -113,7 +118,19 @@ def encode(
             block, processed, table.ids, table.mask, residual_rate=config.residual_rate, activation=jax.nn.relu
         )
     code = dense(params["latent"], processed).reshape(-1)
-    return latent + code if config.latent_update == "residual" else code
+    return code
+
+
+def descend(params: Params, latent: Array, code: Array, code_force: Array, statistics: Statistics) -> Array:
+    """The next latent code [L]: the current one, moved along a learned map of the force on it, and by the network.
+
+    The Hessian of the potential in the space of codes hardly changes, so one matrix can learn its inverse, and the
+    step is then close to Newton's. The force's size spans decades (a collision, a rest): it is compressed.
+    """
+    size = jnp.sqrt(jnp.sum(code_force * code_force) + 1e-20)
+    ratio = size / jnp.exp(statistics.mean[0])
+    compressed = code_force * (jnp.arcsinh(ratio) / size)
+    return latent + compressed @ params["descent"] + code
 
 
 def step(
@@ -126,15 +143,34 @@ def step(
     contact: Contact,
     nearest_vertex: Array,
     timestep: Array,
+    potential: Callable[[Array], Array],
     model: ModelConfig,
     material: MaterialConfig,
 ) -> tuple[Array, Array, Features]:
-    """One step of Phi: the next positions [V, 3] m (relative to the current root), its latent code [L], its inputs."""
+    """One step of Phi: the next positions [V, 3] m (relative to the current root), its latent code [L], its inputs.
+
+    Args:
+        potential: of next positions [V, 3] m in J. Only its gradient at the held garment is used, as an input.
+    """
+
+    def garment(latent):
+        return decode(params, scene, character, latent, window, model)
+
+    descent = model.latent_update == "descent"
+    if descent:
+        held, pullback = jax.vjp(garment, state.latent)
+    else:
+        displaced = skinning.unapply(window.current.garment, state.position)
+        held = skinning.apply(window.following.garment, displaced)
+    force = -jax.grad(potential)(held)
+    code_force = jax.lax.stop_gradient(pullback(force)[0] if descent else jnp.zeros_like(state.latent))
     seen = feature.features(
-        scene, character, state, window, contact, nearest_vertex, timestep, model, material
+        scene, character, state, window, contact, nearest_vertex, timestep, held, force, code_force, model, material
     )
-    latent = encode(params, statistics, scene, seen, state.latent, model)
-    return decode(params, scene, character, latent, window, model), latent, seen
+    seen = jax.lax.stop_gradient(seen)
+    code = encode(params, statistics, scene, seen, model)
+    latent = descend(params, state.latent, code, code_force, statistics["force"]) if descent else code
+    return garment(latent), latent, seen
 
 
 def decode(params: Params, scene: Scene, character: Character, latent: Array, window: Window, model: ModelConfig):

@@ -53,7 +53,7 @@ class PhysicsConfig:
     """The rest shape follows the wearer's betas (a graded garment); false: always the template, as in HOOD."""
     contact_surface: Literal["vertices", "faces"] = "vertices"
     """The body's tangent planes: at its nearest vertex, or at its nearest face centroid, as in HOOD."""
-    reach: float = 0.45  # m, body farther than this from the garment at rest is never searched
+    reach: float = 0.35  # m, body farther than this from the garment at rest is never searched
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,9 @@ class ModelConfig:
     residual_rate: float = 0.5
     latent: int = 240
     """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
-    latent_update: Literal["absolute", "residual"] = "residual"
-    """Whether the network gives Z, or its change from the current frame's."""
+    latent_update: Literal["absolute", "descent"] = "descent"
+    """Whether the network gives Z as in the thesis, or its change from the current frame's Z. The change then starts
+    from a learned linear map of the force on Z, the potential's gradient where the garment would be if held."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
     blendshapes: int = 128

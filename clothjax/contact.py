@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from clothjax.skinning import vertex_normals
 from clothjax.types import Array, Contact
 
+BLOCK = 64
 
 def surface(vertices: Array, faces: Array, kind: str) -> tuple[Array, Array]:
     """Points [P, 3] m and unit normals [P, 3] of a body [B, 3] m: its `vertices`, or its face centroids (`faces`)."""
@@ -23,12 +24,25 @@ def nearest(positions: Array, points: Array) -> Array:
     Distances are taken about the points' centroid: |a|^2 - 2ab cancels badly far from the origin in float32.
     """
     centre = jnp.mean(points, axis=0, keepdims=True)
+    count = -(-points.shape[0] // BLOCK)
+    missing = count * BLOCK - points.shape[0]
     local = points - centre
-    # half the squared distance without the part that does not depend on the point
-    score = 0.5 * jnp.sum(local * local, axis=-1)[None] - jnp.matmul(
-        positions - centre, local.T, precision="highest"
-    )
-    return jnp.argmin(score, axis=1).astype(jnp.int32)
+    half = jnp.pad(0.5 * jnp.sum(local * local, axis=-1), (0, missing), constant_values=jnp.inf)
+    half = half.reshape(count, BLOCK)
+    local = jnp.pad(local, ((0, missing), (0, 0))).reshape(count, BLOCK, 3)
+    positions = positions - centre
+
+    def score(half, local, position):
+        # half the squared distance, without the part that does not depend on the point; written out, so that it
+        # fuses with the reduction and no [V, P] matrix is stored
+        x, y, z = (position[..., i] * local[..., i] for i in range(3))
+        return half - (x + y + z)
+
+    # the minimum of a block vectorises, its place does not: find the block, then the place in it
+    lowest = jnp.min(score(half[None], local[None], positions[:, None, None]), axis=-1)
+    block = jnp.argmin(lowest, axis=1)
+    place = jnp.argmin(score(half[block], local[block], positions[:, None]), axis=1)
+    return (block * BLOCK + place).astype(jnp.int32)
 
 
 def find(positions: Array, current: tuple[Array, Array], following: tuple[Array, Array]) -> Contact:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from clothjax import contact as contacts
-from clothjax import skinning
+from clothjax import physics, skinning
 from clothjax.character import Character, Window
 from clothjax.config import MaterialConfig, ModelConfig
 from clothjax.scene import Scene
@@ -33,6 +33,7 @@ class Features(NamedTuple):
     to_body: Array  # [V, W] the same pair in the other direction
     slots: Array  # [V] int32, the body slot of each garment vertex
     active: Array  # [V] bool, whether the pair is close enough to count
+    force_size: Array  # [1, 1] logarithm of the norm of the force on the latent code
 
 
 def features(
@@ -43,6 +44,9 @@ def features(
     contact: Contact,
     nearest_vertex: Array,
     timestep: Array,
+    held: Array,
+    force: Array,
+    code_force: Array,
     model: ModelConfig,
     material: MaterialConfig,
 ) -> Features:
@@ -52,6 +56,9 @@ def features(
         contact: planes at the garment's nearest body points, for the canonical features.
         nearest_vertex: [V] int32, the body vertex nearest to each garment vertex now.
         timestep: s.
+        held: [V, 3] m, the next positions if the canonical displacement were kept.
+        force: [V, 3] N on the garment there, minus the potential's gradient.
+        code_force: [L], the same force on the latent code.
     """
     current, following = window.current, window.following
     turn = current.heading.T
@@ -90,7 +97,7 @@ def features(
 
     edge_points = {"now": state.position}
     if model.canonical_features:
-        extra, held, drifted = _canonical(character, state, window, contact)
+        extra, drifted = _canonical(character, state, window, contact, held, force)
         garment = jnp.concatenate([garment, extra], axis=-1)
         body = jnp.concatenate([body, jnp.zeros_like(extra)], axis=-1)
         edge_points |= {"held": held, "drifted": drifted}
@@ -115,7 +122,8 @@ def features(
         for sign in (1.0, -1.0)
     )
     active = jnp.sum(offset_now * offset_now, axis=-1) <= model.body_radius**2
-    return Features(garment, body, edges, to_garment, to_body, slots, active)
+    force_size = 0.5 * jnp.log(jnp.sum(code_force * code_force) + 1e-20).reshape(1, 1)
+    return Features(garment, body, edges, to_garment, to_body, slots, active, force_size)
 
 
 def material_inputs(material: Material, config: MaterialConfig) -> Array:
@@ -138,21 +146,25 @@ def scaled(value: Array, limits) -> Array:
     return (value - limits.low) / (limits.high - limits.low)
 
 
-def _canonical(character: Character, state: ClothState, window: Window, contact: Contact):
-    """The state as the next frame's canonical pose sees it, [V, 19]; and where it would be if nothing pushed.
+def _canonical(character: Character, state: ClothState, window: Window, contact: Contact, held: Array, force: Array):
+    """The state as the next frame's canonical pose sees it, [V, 22]; and where it would be if nothing pushed.
 
     `held` keeps the canonical displacement, `drifted` keeps the velocity: the two guesses between which, roughly,
-    the next position lies. Contact is measured from both.
+    the next position lies. Contact is measured from both; the force at `held` says where to go from there, over the
+    weight of the vertex and compressed, since it spans five decades.
     """
     following = window.following.garment
     displacement = skinning.unapply(window.current.garment, state.position) - character.template
-    held = skinning.apply(following, character.template + displacement)
     drifted = state.position + state.velocity
     down = jnp.zeros_like(drifted).at[:, 1].set(-1.0)
     gap_held = contacts.distance(held, contact.point_next, contact.normal_next)
     gap_drifted = contacts.distance(drifted, contact.point_next, contact.normal_next)
+    pull = force / (physics.GRAVITY * character.mass[:, None])
+    size = _length(pull)
+    pull = pull * jnp.where(size > 1e-6, jnp.arcsinh(size) / jnp.maximum(size, 1e-6), 1.0)
     columns = [
         displacement,
+        skinning.unapply_direction(following, pull),
         skinning.unapply(following, drifted) - character.template,
         skinning.unapply_direction(following, down),
         skinning.unapply_direction(following, contact.normal_next),
@@ -162,7 +174,7 @@ def _canonical(character: Character, state: ClothState, window: Window, contact:
         jnp.maximum(0.003 - gap_held, 0.0)[:, None],
         jnp.maximum(0.003 - gap_drifted, 0.0)[:, None],
     ]
-    return jnp.concatenate(columns, axis=-1), held, drifted
+    return jnp.concatenate(columns, axis=-1), drifted
 
 
 def _mesh_edges(senders, receivers, points, template, turn, timestep, inputs):

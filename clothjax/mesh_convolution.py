@@ -41,8 +41,8 @@ def init(
         residual_rate: r in [0, 1], as for `apply`.
 
     Returns:
-        `basis` [I, M, O], `coefficients` [P, K, M] and `bias` [O] if r < 1; `density` [P, K] if r > 0 and P != N;
-        `skip` [I, O] if r > 0 and I != O.
+        `basis` [I, M, O], `coefficients` [P, K, M] and `bias` [O] if r < 1;
+        `density` [P, K] if r > 0 and P != N; `skip` [I, O] if r > 0 and I != O.
 
     Raises:
         ValueError: a rate outside [0, 1].

@@ -62,9 +62,13 @@ def take(
     nearest = planes.index
     if config.physics.contact_surface == "faces":
         nearest = contact.nearest(state.position, window.current.body)
+
+    def potential(new):
+        return losses.potential(new, step, scene.mesh, config.physics)
+
     new, latent, seen = compact_latent.step(
         model["params"], model["statistics"], scene, character, state, window, planes, nearest,
-        step.timestep, config.model, config.material,
+        step.timestep, potential, config.model, config.material,
     )  # fmt: skip
     velocity = new - state.position
     return ClothState(new, velocity, velocity - state.velocity, latent), Taken(new, step, seen)

@@ -10,6 +10,9 @@ from clothjax import graph_sampling, topology
 from clothjax.config import Config
 from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
 
+NEAR = 0.05  # m, body beside the garment
+NEAR_SHARE = 0.05  # of a joint's vertices beside the garment, for the joint to matter
+
 
 class Table(NamedTuple):
     """One mesh-convolution block's neighbours: output p reads inputs ids[p, k] where mask[p, k]."""
@@ -60,16 +63,28 @@ def build(garment: Garment, body: Body, config: Config) -> Scene:
 
 
 def reachable(body: Body, garment: Garment, reach: float) -> Body:
-    """The part of a body that a garment can touch: vertices within `reach` m of it in the canonical pose.
+    """The part of a body that a garment can touch.
 
-    The cut must lie far from the garment: a tangent plane at its edge would act as a wall through the air.
-    Vertices that move with joints driving no part of the garment's neighbourhood (head, hands, feet of a shirt)
-    are left out by the distance alone, so `reach` should exceed how far the garment slides along the body.
+    Kept are the vertices within `reach` m of the garment, in the canonical pose, of those joints that carry part of
+    the body beside it and, since cloth hangs, of the joints below these. Cutting by joint and far past hem and cuffs
+    matters: the tangent plane at the edge of the cut would act as a wall through the air if a garment vertex ever
+    came nearest to it.
     """
     distance, _ = cKDTree(garment.vertices).query(body.vertices)
-    inside = distance < reach
+    joint = np.asarray(body.weights).argmax(axis=1)
+    members = np.maximum(np.bincount(joint, minlength=len(body.joints)), 1)
+    beside = np.bincount(joint[distance < NEAR], minlength=len(body.joints))
+    matters = beside >= NEAR_SHARE * members
+    parents, height = np.asarray(body.parents), np.asarray(body.joints)[:, 1]
+    matters |= (parents >= 0) & matters[parents] & (height < height[parents])
+    inside = (distance < reach) & matters[joint]
     faces = np.asarray(body.faces)
     kept_faces = faces[inside[faces].all(axis=1)]
+    if len(kept_faces) == 0:
+        raise ValueError(
+            f"no part of the body is within {NEAR} m of the garment: they are in different places or units "
+            f"(garment {_box(garment.vertices)}, body {_box(body.vertices)})"
+        )
     kept = np.unique(kept_faces)
     renumbered = np.full(len(inside), -1, np.int32)
     renumbered[kept] = np.arange(len(kept), dtype=np.int32)
@@ -80,6 +95,11 @@ def reachable(body: Body, garment: Garment, reach: float) -> Body:
         shapedirs=body.shapedirs[kept],
         posedirs=None if body.posedirs is None else body.posedirs[kept],
     )
+
+
+def _box(vertices: np.ndarray) -> str:
+    low, high = np.min(vertices, axis=0), np.max(vertices, axis=0)
+    return f"from {np.round(low, 2).tolist()} to {np.round(high, 2).tolist()} m"
 
 
 def laplacian_basis(scene: Scene, count: int, stiffness: float, density: float, timestep: float) -> np.ndarray:

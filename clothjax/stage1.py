@@ -1,6 +1,7 @@
 """Stage 1: Phi trained on the physics alone, in rollouts of a pool of persistent simulations."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -105,6 +106,7 @@ def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
 
 def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
     """The state before the first step."""
+    clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     stiffness = physical_stiffness(config)
     basis = laplacian_basis(
@@ -134,6 +136,7 @@ def physical_stiffness(config: Config) -> float:
 
 def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
     """Shapes of the inputs of Phi in this scene, without computing any."""
+    clips = jax.tree.map(jnp.asarray, clips)
 
     def features(key):
         simulation = begin(key, scene, clips, config)
@@ -142,7 +145,8 @@ def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
         _, planes = rollout.time_step(character, simulation.cloth, window, 1.0 / config.fps, config)
         return compact_latent.feature.features(
             scene, character, simulation.cloth, window, planes, planes.index, jnp.float32(1.0 / config.fps),
-            config.model, config.material,
+            simulation.cloth.position, simulation.cloth.position,
+            simulation.cloth.latent, config.model, config.material,
         )  # fmt: skip
 
     return jax.eval_shape(features, jax.random.key(0))
@@ -157,37 +161,45 @@ def rollout_length(step: int, config: Config) -> int:
 def make_update(
     scene: Scene, clips: Clips, config: Config, frames: int, steps: int
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """A function that takes `steps` training steps of `frames` frames each, and its metrics [steps]."""
+    """A jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
+
+    It consumes its argument (buffers are donated).
+    """
     stage = config.stage1
     transform = optimizer(config)
 
-    def loss_of(params, statistics, simulation, step):
+    def loss_of(params, statistics, simulation, step, clips):
         character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
         return rollout.training_rollout(
             params, statistics, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
             step, frames, config,
         )  # fmt: skip
 
-    def batch_loss(params, statistics, simulations, step):
-        loss, rest = jax.vmap(loss_of, (None, None, 0, None))(params, statistics, simulations, step)
+    def batch_loss(params, statistics, simulations, step, clips):
+        loss, rest = jax.vmap(loss_of, (None, None, 0, None, None))(params, statistics, simulations, step, clips)
         return jnp.mean(loss), (loss, rest)
 
-    def one(state: TrainingState, _):
-        key, begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
+    def one(clips: Clips, state: TrainingState, _):
+        begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
         chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
         simulations = jax.tree.map(lambda x: x[chosen], state.pool)
         restart = jax.random.uniform(restart_key, (stage.batch,)) < stage.restart_probability
         restart |= clips.remaining[simulations.frame] < frames
-        fresh = jax.vmap(lambda k: begin(k, scene, clips, config))(jax.random.split(begin_key, stage.batch))
-        simulations = jax.tree.map(lambda a, b: _where(restart, a, b), fresh, simulations)
+
+        def restarted(simulations):
+            fresh = jax.vmap(lambda k: begin(k, scene, clips, config))(jax.random.split(begin_key, stage.batch))
+            return jax.tree.map(lambda a, b: _where(restart, a, b), fresh, simulations)
+
+        simulations = jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
 
         (loss, (each, (cloth, terms, seen))), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
-            state.params, state.statistics, simulations, state.step
+            state.params, state.statistics, simulations, state.step, clips
         )
         norm = optax.global_norm(gradient)
         good = jnp.isfinite(norm) & jnp.isfinite(loss)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
-        updates, optimizer_state = transform.update(gradient, state.optimizer, state.params)
+        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
+            updates, optimizer_state = transform.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
         # a blown-up simulation starts anew at its next turn; so does one whose update was skipped
         lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0) | ~jnp.isfinite(each)
@@ -218,7 +230,12 @@ def make_update(
         metrics |= {name: jnp.mean(terms[name]) for name in losses.TERMS}
         return new, metrics
 
-    return lambda state: jax.lax.scan(one, state, None, length=steps)
+    @partial(jax.jit, donate_argnums=0)
+    def update(state, clips):
+        return jax.lax.scan(partial(one, clips), state, None, length=steps)
+
+    clips = jax.tree.map(jnp.asarray, clips)
+    return lambda state: update(state, clips)
 
 
 def _where(condition: Array, new: Array, old: Array) -> Array:

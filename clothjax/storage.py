@@ -159,7 +159,7 @@ def joint_names(path: str | Path) -> tuple[str, ...]:
 
 
 def canonical_rotation(path: str | Path) -> np.ndarray:
-    """Rotations [J, 3, 3] that turn a body's bones from its canonical pose to a T-pose; identity if not stored."""
+    """Rotations [J, 3, 3] of a body's bones from its canonical pose to a T-pose; identity if not stored."""
     with _open(path, "body") as file:
         names = _names(file, {})
         if "canonical_rotation" not in file:

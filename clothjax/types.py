@@ -23,7 +23,7 @@ class Body(NamedTuple):
 
 
 class Garment(NamedTuple):
-    """A garment aligned with its body's canonical pose, with the body's skinning and shape data diffused onto it."""
+    """A garment aligned with its body's canonical pose, with the body's skinning and shape diffused onto it."""
 
     vertices: Array  # [V, 3] m
     faces: Array  # [F, 3] int32
@@ -87,7 +87,8 @@ class ClothState(NamedTuple):
     """A garment in motion. Positions are relative to the root's translation at the current frame."""
 
     position: Array  # [V, 3] m
-    previous: Array  # [V, 3] m, one frame earlier
+    velocity: Array  # [V, 3] m per frame
+    acceleration: Array  # [V, 3] m per frame^2
     latent: Array  # [L] the code that produced `position`
 
 

@@ -1,0 +1,128 @@
+"""Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame."""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax import garment_model, latent_predictor, skinning
+from clothjax.config import Config
+from clothjax.latent_predictor import Normalizers
+from clothjax.types import Array, Body, Garment, Material, Motion, Pose
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("predictor", "garment_params", "normalizers", "garment", "joints", "constants"),
+    meta_fields=("parents", "kept", "config"),
+)
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A garment on a character, ready to run: parameters and assets as a pytree, configuration static."""
+
+    predictor: dict
+    garment_params: dict  # decoder and blend shapes
+    normalizers: Normalizers
+    garment: Garment  # its vertices are the shaped template
+    joints: Array  # [J, 3] m of the shaped body
+    constants: Array  # [C] betas and material as the predictor sees them
+    parents: tuple[int, ...]
+    kept: tuple[int, ...]
+    config: Config
+
+
+class State(NamedTuple):
+    """What the model carries from frame to frame."""
+
+    latent: Array  # [L] in standard deviations
+    rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
+    translation: Array  # [2, 3] m
+
+
+def build(
+    config: Config,
+    garment: Garment,
+    body: Body,
+    names: tuple[str, ...],
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    *,
+    betas: Array | None = None,
+    material: Material | None = None,
+) -> Model:
+    """A model of one character; `betas` [S] default to the mean body, the material to the configured one."""
+    betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
+    if betas.shape != (body.shapedirs.shape[-1],):
+        raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
+    cloth = config.material
+    if material is None:
+        material = Material(cloth.density, cloth.mu, cloth.lam, cloth.bending)
+    material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
+    return Model(
+        predictor=predictor,
+        garment_params=garment_params,
+        normalizers=normalizers,
+        garment=garment._replace(vertices=skinning.shaped_vertices(garment, betas)),
+        joints=skinning.shaped_joints(body, betas),
+        constants=latent_predictor.constant_inputs(betas, material, cloth),
+        parents=tuple(int(p) for p in body.parents),
+        kept=tuple(int(k) for k in latent_predictor.kept_joints(names, config.stage2)),
+        config=config,
+    )
+
+
+def initial_state(model: Model, pose: Pose) -> State:
+    """The state before the first frame: the code is zero and the character has been standing in `pose`."""
+    size = model.normalizers.latent.mean.shape[0]
+    zero = latent_predictor.normalise(model.normalizers.latent, jnp.zeros(size))
+    rotations = jnp.asarray(pose.rotations, jnp.float32)
+    translation = jnp.asarray(pose.translation, jnp.float32)
+    return State(zero, jnp.stack([rotations, rotations]), jnp.stack([translation, translation]))
+
+
+@jax.jit
+def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
+    """The next frame: a new state, and the garment's vertices [V, 3] m in the world.
+
+    Args:
+        pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
+    """
+    parents = np.array(model.parents)
+    rotations = jnp.concatenate([pose.rotations[None], state.rotations])
+    advance = jnp.stack([pose.translation - state.translation[0], state.translation[0] - state.translation[1]])
+    inputs = latent_predictor.pose_inputs(
+        rotations, advance, model.joints, parents, np.array(model.kept), model.config.fps
+    )
+    latent = latent_predictor.predict(
+        model.predictor,
+        state.latent,
+        latent_predictor.normalise(model.normalizers.pose, inputs, bound=latent_predictor.POSE_BOUND),
+        model.constants,
+    )
+    code = latent_predictor.denormalise(model.normalizers.latent, latent)
+    free = 1.0 - model.garment.pinned.astype(code.dtype)
+    displaced = garment_model.displacement(model.garment_params, code, free, model.config.model)
+    transforms = skinning.joint_transforms(pose.rotations, model.joints, parents)
+    vertices = garment_model.vertices(
+        displaced, model.garment.vertices, skinning.blend(model.garment.weights, transforms)
+    )
+    following = State(
+        latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]])
+    )
+    return following, vertices + pose.translation[None]
+
+
+@jax.jit
+def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
+    """A whole motion: vertices [T, V, 3] m in the world, and whether each frame is finite, `ok` [T].
+
+    The first frame is the garment settled on the standing first pose.
+    """
+    poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
+    first = jax.tree.map(lambda x: x[0], poses)
+    _, vertices = jax.lax.scan(lambda s, p: step(model, s, p), initial_state(model, first), poses)
+    return vertices, jnp.all(jnp.isfinite(vertices), axis=(1, 2))

@@ -1,0 +1,76 @@
+"""What a training run keeps in its folder besides checkpoints: its lock, its metrics and the time it took."""
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def lock(directory: Path) -> Iterator[None]:
+    """Held while a run trains in the directory. The system lets go of it however the process ends.
+
+    Raises:
+        ValueError: if another run holds it.
+    """
+    import fcntl  # not on Windows
+
+    with open(directory / "lock", "a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            raise ValueError(
+                f"{directory}: process {file.read()} is training here; wait for it, or use another directory"
+            ) from error
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, float]], None]]:
+    """A function that appends a row to `metrics.jsonl`, after the rows of steps after `step` are gone from it."""
+    path = directory / "metrics.jsonl"
+    kept = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            if json.loads(line)["step"] > step:
+                break
+        except json.JSONDecodeError:  # the line that a killed process was writing
+            break
+        kept.append(line + "\n")
+    _replace(path, "".join(kept))
+    with open(path, "a") as file:
+
+        def write(row: dict[str, float]) -> None:
+            finite = {name: value if math.isfinite(value) else None for name, value in row.items()}
+            file.write(json.dumps(finite) + "\n")
+            file.flush()
+
+        yield write
+
+
+def read_seconds(directory: Path) -> tuple[float, float]:
+    """Seconds and compile seconds of all sessions so far, with what was computed and lost again; 0 if unknown."""
+    path = directory / "training.json"
+    if not path.exists():
+        return 0.0, 0.0
+    record = json.loads(path.read_text())
+    return record["seconds"], record["compile_seconds"]
+
+
+def write_seconds(directory: Path, seconds: float, compile_seconds: float, step: int, steps: int) -> None:
+    """Keeps the time spent up to `step` of `steps` in `training.json`."""
+    record = {"step": step, "steps": steps, "seconds": seconds, "compile_seconds": compile_seconds}
+    _replace(directory / "training.json", json.dumps(record) + "\n")
+
+
+def _replace(path: Path, text: str) -> None:
+    """Writes a file whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    partial.replace(path)

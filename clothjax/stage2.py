@@ -1,0 +1,183 @@
+"""Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (21)."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from clothjax import character as characters
+from clothjax import clips as motion
+from clothjax import compact_latent, latent_predictor, rollout, stage1
+from clothjax.clips import Clips
+from clothjax.config import Config
+from clothjax.latent_predictor import Normalizers
+from clothjax.scene import Scene
+from clothjax.types import Array, Pose
+
+
+class Teacher(NamedTuple):
+    """Rollouts of Phi: N sequences of T + 1 codes, and the inputs that lead from each to the next."""
+
+    latents: Array  # [N, T + 1, L]; the first is zero, as Psi's state is before its first frame
+    poses: Array  # [N, T, P]
+    constants: Array  # [N, C]
+
+
+class TrainingState(NamedTuple):
+    """All that stage 2 is at a step."""
+
+    step: Array  # int32
+    key: Array
+    params: dict
+    average: dict
+    optimizer: optax.OptState
+    normalizers: Normalizers
+
+
+def teach(
+    model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config, progress: Callable = lambda done: None
+) -> Teacher:
+    """Rolls Phi out on random clips, bodies and materials.
+
+    Args:
+        model: Phi's `params` and `statistics`.
+        kept: joints that are inputs.
+        progress: called with the number of sequences done.
+    """
+    stage = config.stage2
+    fps = config.fps
+
+    def sequence(key: Array):
+        simulation = stage1.begin(key, scene, clips, config)
+        character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
+        frames = simulation.frame + jnp.arange(stage.frames)
+        poses = jax.vmap(lambda t: motion.poses(clips, t))(frames)
+        _, states, latents = rollout.play(model, scene, character, poses, config)
+
+        def inputs(pose: Pose):
+            return latent_predictor.pose_inputs(
+                pose.rotations[::-1], jnp.stack([pose.translation[2], -pose.translation[0]]),
+                character.joints, scene.body.parents, kept, fps,
+            )  # fmt: skip
+
+        constants = latent_predictor.constant_inputs(simulation.betas, simulation.material, config.material)
+        first = jnp.zeros_like(latents[:1])
+        return jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants
+
+    run = jax.jit(jax.vmap(sequence))
+    keys = jax.random.split(jax.random.key(stage.seed + 1), stage.sequences)
+    size = min(8, stage.sequences)  # sequences at a time: enough to fill the cores, little memory
+    parts = []
+    for start in range(0, stage.sequences, size):
+        parts.append(jax.device_get(run(keys[start : start + size])))
+        progress(min(start + size, stage.sequences))
+    teacher = Teacher(*(np.concatenate(part) for part in zip(*parts)))
+    good = np.isfinite(teacher.latents).all(axis=(1, 2))
+    if not good.any():
+        raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")
+    return Teacher(*(part[good] for part in teacher))
+
+
+def init(teacher: Teacher, config: Config) -> TrainingState:
+    """The state before the first step, its normalizers measured on the teacher's rollouts."""
+    key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
+    size = teacher.latents.shape[-1]
+    params = latent_predictor.init(
+        model_key, size, teacher.poses.shape[-1], teacher.constants.shape[-1], config.stage2
+    )
+    return TrainingState(
+        step=jnp.int32(0),
+        key=key,
+        params=params,
+        average=jax.tree.map(jnp.array, params),
+        optimizer=optimizer(config).init(params),
+        normalizers=Normalizers(
+            latent=latent_predictor.measure(teacher.latents[:, 1:].reshape(-1, size)),
+            pose=latent_predictor.measure(teacher.poses.reshape(-1, teacher.poses.shape[-1])),
+        ),
+    )
+
+
+def optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam behind a clipped norm, at a cosine-decayed rate."""
+    stage = config.stage2
+    return optax.chain(
+        optax.clip_by_global_norm(stage.clip),
+        optax.adam(optax.cosine_decay_schedule(stage.learning_rate, stage.steps, alpha=0.01)),
+    )
+
+
+def rollout_loss(
+    params: dict, normalizers: Normalizers, latents: Array, poses: Array, constants: Array, key: Array, config: Config
+) -> Array:
+    """Mean squared error of one closed-loop rollout, in variances of the code.
+
+    Z_t is perturbed, so that the predictor learns to come back: plain one-step regression diverges in closed loop.
+
+    Args:
+        latents: [H + 1, L] teacher codes; poses: [H, P]; constants: [C]; key: of the noise.
+    """
+    targets = jax.vmap(lambda z: latent_predictor.normalise(normalizers.latent, z))(latents)
+    poses = jax.vmap(lambda x: latent_predictor.normalise(normalizers.pose, x, bound=latent_predictor.POSE_BOUND))(poses)
+    noise = config.stage2.noise * jax.random.normal(key, targets[0].shape)
+
+    def body(latent, inputs):
+        pose, target = inputs
+        if config.stage2.pushforward:
+            latent = jax.lax.stop_gradient(latent)
+        predicted = latent_predictor.predict(params, latent, pose, constants)
+        return predicted, jnp.mean((predicted - target) ** 2)
+
+    _, errors = jax.lax.scan(body, targets[0] + noise, (poses, targets[1:]))
+    return errors[-1] if config.stage2.pushforward else jnp.mean(errors)
+
+
+def make_update(
+    teacher: Teacher, config: Config, steps: int
+) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
+    """A jitted function that takes `steps` training steps, and their metrics [steps]; it consumes its argument."""
+    stage = config.stage2
+    transform = optimizer(config)
+    sequences, frames = teacher.poses.shape[:2]
+
+    def loss(params, normalizers, teacher, key):
+        keys = jax.random.split(key, 3)
+        which = jax.random.randint(keys[0], (stage.batch,), 0, sequences)
+        begin = jax.random.randint(keys[1], (stage.batch,), 0, frames - stage.rollout + 1)
+
+        def one(sequence, begin, key):
+            latents = jax.lax.dynamic_slice_in_dim(teacher.latents[sequence], begin, stage.rollout + 1)
+            poses = jax.lax.dynamic_slice_in_dim(teacher.poses[sequence], begin, stage.rollout)
+            constants = teacher.constants[sequence]
+            return rollout_loss(params, normalizers, latents, poses, constants, key, config)
+
+        return jnp.mean(jax.vmap(one)(which, begin, jax.random.split(keys[2], stage.batch)))
+
+    def one(teacher: Teacher, state: TrainingState, _):
+        key = jax.random.fold_in(state.key, state.step)
+        value, gradient = jax.value_and_grad(loss)(state.params, state.normalizers, teacher, key)
+        norm = optax.global_norm(gradient)
+        good = jnp.isfinite(norm) & jnp.isfinite(value)
+        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
+        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
+            updates, optimizer_state = transform.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, updates)
+        average = jax.tree.map(lambda a, p: 0.99 * a + 0.01 * p, state.average, params)
+        new = (params, average, optimizer_state)
+        old = (state.params, state.average, state.optimizer)
+        params, average, optimizer_state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+        new = state._replace(
+            step=state.step + 1, params=params, average=average, optimizer=optimizer_state
+        )
+        return new, {"loss": value, "gradient_norm": norm, "nonfinite": ~good}
+
+    @partial(jax.jit, donate_argnums=0)
+    def update(state, teacher):
+        return jax.lax.scan(partial(one, teacher), state, None, length=steps)
+
+    teacher = jax.tree.map(jnp.asarray, teacher)
+    return lambda state: update(state, teacher)
