@@ -59,10 +59,10 @@ def fit(
 ) -> Fitted:
     """Trains to `steps`, going on from the directory's newest checkpoint if there is one.
 
-    The directory gets `checkpoints/`, `metrics.jsonl` (one line a call: the median of every metric, its maximum
-    as `<name>_max`, the number of `nonfinite` steps, what `evaluate` returns) and `training.json` (steps and
-    seconds). All that the training depends on is in the state, so a run that is stopped at any moment and resumed
-    ends bit for bit as one that was not.
+    The directory gets `checkpoints/`, `metrics.jsonl` (one line a call: the median of every metric, its
+    maximum as `<name>_max`, the number of `nonfinite` steps, what `evaluate` returns) and `training.json`
+    (steps and seconds). All that the training depends on is in the state, so a run that is stopped at any
+    moment and resumed ends bit for bit as one that was not.
 
     Args:
         update: a jitted function that takes `steps_per_call` steps; it may donate its argument. Its metrics

@@ -33,7 +33,7 @@ def lock(directory: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, float]], None]]:
-    """A function that appends a row to `metrics.jsonl`, after the rows of steps after `step` are gone from it."""
+    """A function that appends rows to `metrics.jsonl`, which first loses those after `step`."""
     path = directory / "metrics.jsonl"
     kept = []
     for line in path.read_text().splitlines() if path.exists() else []:
@@ -55,7 +55,7 @@ def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, flo
 
 
 def read_seconds(directory: Path) -> tuple[float, float]:
-    """Seconds and compile seconds of all sessions so far, with what was computed and lost again; 0 if unknown."""
+    """Seconds and compile seconds of all sessions so far, with what they lost again; 0 if unknown."""
     path = directory / "training.json"
     if not path.exists():
         return 0.0, 0.0
