@@ -113,8 +113,6 @@ def test_training_records_what_it_did(tmp_path, capsys):
 SESSION = """
 import sys
 sys.path.insert(0, sys.argv[1])
-import jax
-jax.config.update("jax_platforms", "cpu")
 import test_fit as toy
 toy.train(sys.argv[2], toy.make_update(slow=0.15), checkpoint_seconds=0.0, report_seconds=0.3)
 """

@@ -1,0 +1,45 @@
+# Needs Python 3.11 or newer and, the first time, a package index. Everything runs in a virtual environment that
+# is made once, by uv where it is there and works, else by pip, and again when pyproject.toml or uv.lock change.
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+INSTALLED := $(VENV)/.installed
+CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
+
+.PHONY: quickstart test test-slow lint
+
+quickstart: $(INSTALLED)  ## train both stages on the embedded body, evaluate, render, export
+	@$(PYTHON) -m experiments.quickstart
+
+test: $(INSTALLED)  ## the tests of every day
+	@$(PYTHON) -m pytest -m "not slow" -n 2
+
+test-slow: $(INSTALLED)  ## the long ones
+	@$(PYTHON) -m pytest -m slow
+
+lint: $(INSTALLED)
+	@$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
+
+$(INSTALLED): pyproject.toml uv.lock
+	@export UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never
+	if ! { command -v uv >/dev/null && uv sync --frozen --all-extras; }; then
+	    echo "uv is not there or did not succeed: installing with pip"
+	    made=
+	    for python in $(CANDIDATES); do
+	        if "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	                && "$$python" -m venv --clear $(VENV); then
+	            made=yes
+	            break
+	        fi
+	    done
+	    if [ -z "$$made" ]; then
+	        echo "no Python 3.11 or newer with its venv module (tried: $(CANDIDATES))" >&2
+	        exit 1
+	    fi
+	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,export,render]'
+	fi
+	touch $@
