@@ -124,6 +124,39 @@ def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None)
     return _restore(Path(directory).resolve(), like, step, whole=False)
 
 
+def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint]:
+    """Parts of the newest undamaged checkpoint as nested dictionaries and lists, whatever their shapes are.
+
+    Fields of a NamedTuple come back as a dictionary.
+
+    Raises:
+        ValueError: if there is no undamaged checkpoint, or it has no such part.
+    """
+    about = latest(directory)
+    like: dict = {part: {} for part in parts}
+    for name, leaf in about.leaves.items():
+        *path, last = name.split("/")
+        if path and path[0] in parts:
+            node = like
+            for key in path:
+                node = node.setdefault(key, {})
+            node[last] = jax.ShapeDtypeStruct(tuple(leaf["shape"]), leaf["dtype"])
+    empty = [part for part in parts if not like[part]]
+    if empty:
+        raise ValueError(f"{about.path}: no {', '.join(empty)} in this checkpoint; it is of another kind of training")
+    found, about = restore_parts(directory, {part: _lists(like[part]) for part in parts}, step=about.step)
+    return found, about
+
+
+def _lists(tree: Any) -> Any:
+    """Dictionaries with the keys 0, 1, 2, ... as lists."""
+    if not isinstance(tree, dict):
+        return tree
+    if all(key.isdecimal() for key in tree):
+        return [_lists(tree[str(i)]) for i in range(len(tree))]
+    return {key: _lists(value) for key, value in tree.items()}
+
+
 def set_aside(directory: str | Path, after: int) -> None:
     """Renames later checkpoints to `<step>.damaged`, so that a run resumed before them can save again."""
     directory = Path(directory)

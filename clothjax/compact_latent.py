@@ -33,23 +33,29 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
     encoder["world"] = init_mlp(keys[1], (example.to_garment.shape[-1], *hidden))
     for index, name in enumerate(sorted(example.edges)):
         encoder[name] = init_mlp(jax.random.fold_in(keys[2], index), (example.edges[name].shape[-1], *hidden))
+    left, per_vertex = latent_size(scene, config)
     convolution, channels = [], width
     for index, (level, table) in enumerate(zip(config.convolution, scene.tables)):
         subkey = jax.random.fold_in(keys[3], index)
         convolution.append(
-            mesh_convolution.init(subkey, table, channels, level.features, config.convolution_bases)
+            mesh_convolution.init(
+                subkey, table, channels, level.features or per_vertex, config.convolution_bases, config.residual_rate
+            )
         )
         channels = level.features
-    left, per_vertex = latent_size(scene, config)
     size = left * per_vertex
-    params = {"descent": jnp.zeros((size, size))} if config.latent_update == "descent" else {}
+    params = {}
+    if config.latent_update == "descent":
+        params["descent"] = jnp.zeros((size, size))
+    if channels is not None:
+        # a change of the code starts small, a code starts at unit size
+        params["latent"] = init_dense(keys[7], channels, per_vertex, gain=1e-4 if params else 1.0)
     return params | {
         "type_embedding": jax.random.normal(keys[4], (4, TYPE_EMBEDDING)),
         "level_embedding": jax.random.normal(keys[5], (8, LEVEL_EMBEDDING)),
         "encoder": encoder,
         "processor": graph_network.init_processor(keys[6], config.processor, width, config.mlp_layers),
         "convolution": convolution,
-        "latent": init_dense(keys[7], channels, per_vertex, gain=1e-4 if config.latent_update == "descent" else 1.0),
         "garment": garment_model.init(jax.random.fold_in(key, 9), left * per_vertex, basis, config),
     }
 
@@ -117,8 +123,9 @@ def encode(
         processed = mesh_convolution.apply(
             block, processed, table.ids, table.mask, residual_rate=config.residual_rate, activation=jax.nn.relu
         )
-    code = dense(params["latent"], processed).reshape(-1)
-    return code
+    if "latent" in params:
+        processed = dense(params["latent"], processed)
+    return processed.reshape(-1)
 
 
 def descend(params: Params, latent: Array, code: Array, code_force: Array, statistics: Statistics) -> Array:

@@ -100,7 +100,8 @@ class Stack:
 class Level:
     """One mesh-convolution block."""
 
-    features: int
+    features: int | None = None
+    """Channels it gives; null, for the last one: as many as the latent size asks for, with no layer after it."""
     stride: int = 2
     radius: int = 2
 
@@ -139,6 +140,11 @@ class ModelConfig:
     def __post_init__(self):
         _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
+        _require(len(self.convolution) > 0, "the convolution needs a block")
+        _require(
+            all(level.features is not None for level in self.convolution[:-1]),
+            "only the last convolution block may leave its features open",
+        )
         known = {"mesh", "coarse0", "coarse1", "coarse2", "coarse3"}
         for stack in self.processor:
             unknown = set(stack.edges) - known

@@ -2,14 +2,16 @@
 
 import dataclasses
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import garment_model, latent_predictor, skinning
+from clothjax import checkpoint, configuration, garment_model, latent_predictor, skinning, storage
 from clothjax.config import Config
+from clothjax.features import Statistics
 from clothjax.latent_predictor import Normalizers
 from clothjax.types import Array, Body, Garment, Material, Motion, Pose
 
@@ -72,6 +74,33 @@ def build(
         parents=tuple(int(p) for p in body.parents),
         kept=tuple(int(k) for k in latent_predictor.kept_joints(names, config.stage2)),
         config=config,
+    )
+
+
+def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
+    """The model of a finished run: the folder that holds `stage2`, or a shipped model.
+
+    Args:
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
+    """
+    directory = Path(run) / "stage2" / "checkpoints"
+    parts, about = checkpoint.read(directory, "average", "normalizers", "garment")
+    config = configuration.from_dict(Config, about.config, str(directory))
+    body = storage.load_body(config.body)
+    return build(
+        config,
+        storage.load_garment(config.garment, body),
+        body,
+        storage.joint_names(config.body),
+        parts["garment"],
+        parts["average"],
+        Normalizers(*(Statistics(**parts["normalizers"][name]) for name in Normalizers._fields)),
+        betas=betas,
+        material=material,
     )
 
 

@@ -13,6 +13,7 @@ from clothjax import clips as motion
 from clothjax import compact_latent, losses, rollout
 from clothjax.clips import Clips
 from clothjax.config import Config, Range
+from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.scene import Scene, laplacian_basis
 from clothjax.types import Array, ClothState, Material
@@ -44,7 +45,7 @@ def sample_material(key: Array, config: Config) -> Material:
     """A material from the training ranges, or the configured one."""
     cloth = config.material
     if not cloth.sample:
-        return default_material(config)
+        return configured_material(config)
 
     def draw(key: Array, limits: Range) -> Array:
         uniform = jax.random.uniform(key)
@@ -54,12 +55,6 @@ def sample_material(key: Array, config: Config) -> Material:
 
     ranges = (cloth.density_range, cloth.mu_range, cloth.lam_range, cloth.bending_range)
     return Material(*(draw(k, limits) for k, limits in zip(jax.random.split(key, 4), ranges)))
-
-
-def default_material(config: Config) -> Material:
-    """The configured material."""
-    cloth = config.material
-    return Material(*(jnp.float32(value) for value in (cloth.density, cloth.mu, cloth.lam, cloth.bending)))
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
@@ -156,6 +151,21 @@ def rollout_length(step: int, config: Config) -> int:
     """Frames of one update at a training step: the curriculum."""
     stage = config.stage1
     return min(max(stage.rollout, stage.rollout_end), stage.rollout + step // stage.rollout_every)
+
+
+def make_curriculum(
+    scene: Scene, clips: Clips, config: Config, steps: int
+) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
+    """`make_update` with the rollout growing as training proceeds; one compilation for each length."""
+    made = {}
+
+    def update(state: TrainingState):
+        frames = rollout_length(int(state.step), config)
+        if frames not in made:
+            made[frames] = make_update(scene, clips, config, frames, steps)
+        return made[frames](state)
+
+    return update
 
 
 def make_update(

@@ -1,5 +1,6 @@
 """Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (21)."""
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -36,12 +37,13 @@ class TrainingState(NamedTuple):
     average: dict
     optimizer: optax.OptState
     normalizers: Normalizers
+    garment: dict  # the frozen decoder and blend shapes: with them, a checkpoint is a whole Psi
 
 
 def teach(
     model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config, progress: Callable = lambda done: None
-) -> Teacher:
-    """Rolls Phi out on random clips, bodies and materials.
+) -> tuple[Teacher, float]:
+    """Rolls Phi out on random clips, bodies and materials; also tells the seconds it took.
 
     Args:
         model: Phi's `params` and `statistics`.
@@ -50,6 +52,8 @@ def teach(
     """
     stage = config.stage2
     fps = config.fps
+    began = time.monotonic()
+    clips = jax.tree.map(jnp.asarray, clips)
 
     def sequence(key: Array):
         simulation = stage1.begin(key, scene, clips, config)
@@ -79,10 +83,10 @@ def teach(
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
         raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")
-    return Teacher(*(part[good] for part in teacher))
+    return Teacher(*(part[good] for part in teacher)), time.monotonic() - began
 
 
-def init(teacher: Teacher, config: Config) -> TrainingState:
+def init(teacher: Teacher, garment: dict, config: Config) -> TrainingState:
     """The state before the first step, its normalizers measured on the teacher's rollouts."""
     key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
     size = teacher.latents.shape[-1]
@@ -95,6 +99,7 @@ def init(teacher: Teacher, config: Config) -> TrainingState:
         params=params,
         average=jax.tree.map(jnp.array, params),
         optimizer=optimizer(config).init(params),
+        garment=jax.tree.map(jnp.array, garment),
         normalizers=Normalizers(
             latent=latent_predictor.measure(teacher.latents[:, 1:].reshape(-1, size)),
             pose=latent_predictor.measure(teacher.poses.reshape(-1, teacher.poses.shape[-1])),

@@ -1,0 +1,89 @@
+"""An experiment's fixed parts, put together from its configuration: files, scene, clips, character."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax import clips, scene, storage
+from clothjax.clips import Clips
+from clothjax.config import Config
+from clothjax.scene import Scene
+from clothjax.types import Body, Garment, Material, Motion
+
+
+class Experiment(NamedTuple):
+    """What a configuration names, loaded."""
+
+    config: Config
+    names: tuple[str, ...]  # of the joints
+    body: Body  # whole
+    garment: Garment
+    scene: Scene
+
+
+def assemble(config: Config) -> Experiment:
+    """Loads the garment and the body of a configuration and builds their scene."""
+    body = storage.load_body(config.body)
+    garment = storage.load_garment(config.garment, body)
+    return Experiment(
+        config, storage.joint_names(config.body), body, garment, scene.build(garment, body, config)
+    )
+
+
+def motion(experiment: Experiment, name: str) -> Motion:
+    """A clip, by asset name or path, checked against the experiment's joints and frame rate."""
+    clip = storage.load_motion(name, experiment.names)
+    if abs(clip.fps - experiment.config.fps) > 1e-3:
+        raise ValueError(
+            f"{name} has {clip.fps} frames a second, the experiment {experiment.config.fps}; "
+            "resample the clip when importing it (data_prep), or set `fps`"
+        )
+    return clip
+
+
+def training_motions(config: Config) -> tuple[str, ...]:
+    """The clips to train on: those named, or every embedded one but those kept for evaluation."""
+    if config.motions:
+        return config.motions
+    kept = {Path(name).stem for name in config.evaluation.motions}
+    return tuple(name for name in storage.asset_names("motion") if name not in kept)
+
+
+def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
+    """The training clips on one reel, and the number of frames left out of each for moving impossibly fast."""
+    names = training_motions(experiment.config)
+    motions = [motion(experiment, name) for name in names]
+    bad = [storage.bad_frames(clip, experiment.body) for clip in motions]
+    # the kind of motion, as in walk_0 or cmu_01_02: kinds are drawn equally often
+    families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
+    shortest = max(experiment.config.stage1.rollout_end, experiment.config.stage1.rollout) + 1
+    reel = clips.concatenate(motions, families, bad, shortest)
+    return reel, {name: len(wrong) for name, wrong in zip(names, bad)}
+
+
+def windows(clip: Motion) -> Clips:
+    """One clip on a reel of its own, every frame of it usable."""
+    return clips.concatenate([clip], [""], [np.zeros(0, int)], 1)
+
+
+def there_and_back(clip: Motion, frames: int) -> Motion:
+    """A clip played forwards and backwards until it has `frames` frames: long, and nowhere a jump."""
+    count = len(clip.translation)
+    period = max(2 * count - 2, 1)
+    order = np.abs((np.arange(frames) + count - 1) % period - (count - 1))
+    return Motion(clip.rotations[order], clip.translation[order], clip.fps)
+
+
+def material(config: Config) -> Material:
+    """The configured material."""
+    cloth = config.material
+    return Material(*(jnp.float32(value) for value in (cloth.density, cloth.mu, cloth.lam, cloth.bending)))
+
+
+def betas(config: Config) -> np.ndarray:
+    """The body shape that evaluation uses: drawn from its own seed, uniform in +-`evaluation.betas`."""
+    size = storage.load_body(config.body).shapedirs.shape[-1]
+    limit = config.evaluation.betas
+    return np.random.default_rng(config.evaluation.betas_seed).uniform(-limit, limit, size).astype(np.float32)

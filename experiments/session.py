@@ -1,0 +1,46 @@
+"""What every program here does around its work: compilation cache, progress, one clear line for a user's mistake."""
+
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+from tqdm import tqdm
+
+
+def setup() -> None:
+    """Keeps compiled programs between runs, in `.jax_cache` or where JAX_COMPILATION_CACHE_DIR says."""
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        jax.config.update("jax_compilation_cache_dir", str(Path(".jax_cache").absolute()))
+
+
+@contextlib.contextmanager
+def fail_clearly() -> Iterator[None]:
+    """Ends the program with one line and exit code 1 on a mistake of the user's or a training that diverged."""
+    try:
+        yield
+    except (ValueError, FileNotFoundError, FloatingPointError, ImportError) as error:
+        if os.environ.get("CLOTHJAX_TRACEBACK"):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+@contextlib.contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A function to call with the amount done: a bar on a terminal, a line every ten seconds elsewhere."""
+    terminal = sys.stderr.isatty()
+    last = time.monotonic()
+    with tqdm(total=total, desc=what, disable=not terminal, leave=False) as bar:
+
+        def report(done: int) -> None:
+            nonlocal last
+            bar.update(done - bar.n)
+            if not terminal and (time.monotonic() - last > 10 or done == total):
+                last = time.monotonic()
+                print(f"{what}: {done}/{total}", flush=True)
+
+        yield report

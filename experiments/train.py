@@ -1,0 +1,90 @@
+"""Trains both stages of an experiment; run it again to go on where it stopped.
+
+    python -m experiments.train configs/quickstart.yaml
+    python -m experiments.train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
+
+It leaves `stage1/` and `stage2/` in the run's folder, each with checkpoints, metrics.jsonl and training.json.
+"""
+
+import sys
+from pathlib import Path
+
+from clothjax import checkpoint, configuration, experiment, fit, latent_predictor, stage1, stage2
+from clothjax.config import Config
+from clothjax.features import Statistics
+from experiments.session import fail_clearly, progress, setup
+
+STEPS_PER_CALL = 20
+
+
+def main(argv: list[str]) -> None:
+    config = configuration.cli(Config, argv)
+    train(config, run_directory(config, argv))
+
+
+def run_directory(config: Config, argv: list[str]) -> Path:
+    """Where a run is kept: as configured, or named after its configuration file."""
+    return Path(config.directory or Path("runs") / Path(argv[0]).stem)
+
+
+def train(config: Config, directory: Path) -> dict[str, float]:
+    """Both stages; returns the seconds each took, with `compile_seconds` and `teacher_seconds` apart."""
+    whole = experiment.assemble(config)
+    reel, bad = experiment.training_clips(whole)
+    for name, count in bad.items():
+        if count:
+            print(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
+    kept = configuration.to_dict(config)
+
+    print(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
+    first = fit.fit(
+        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL),
+        stage1.init(whole.scene, reel, config),
+        steps=config.stage1.steps,
+        steps_per_call=STEPS_PER_CALL,
+        directory=directory / "stage1",
+        config=kept,
+        description=f"stage 1, {config.garment}",
+        may_differ=DIFFERENT_IN_STAGE1,
+    )
+    model = {"params": first.state.average, "statistics": first.state.statistics}
+    joints = latent_predictor.kept_joints(whole.names, config.stage2)
+
+    print(f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi")
+    with progress("rolling out the teacher", config.stage2.sequences) as report:
+        teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report)
+    second = fit.fit(
+        stage2.make_update(teacher, config, STEPS_PER_CALL),
+        stage2.init(teacher, first.state.average["garment"], config),
+        steps=config.stage2.steps,
+        steps_per_call=STEPS_PER_CALL,
+        directory=directory / "stage2",
+        config=kept,
+        description=f"stage 2, {config.garment}",
+        may_differ=("directory", "evaluation"),
+    )
+    return {
+        "stage1_seconds": first.seconds,
+        "stage2_seconds": second.seconds,
+        "teacher_seconds": seconds,
+        "compile_seconds": first.compile_seconds + second.compile_seconds,
+    }
+
+
+# stage 1 does not read these, so a run may change them and go on
+DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2")
+
+
+def load_phi(directory: Path) -> tuple[experiment.Experiment, dict]:
+    """Phi of a run: its experiment, and averaged `params` with `statistics`."""
+    checkpoints = Path(directory) / "stage1" / "checkpoints"
+    parts, about = checkpoint.read(checkpoints, "average", "statistics")
+    config = configuration.from_dict(Config, about.config, str(checkpoints))
+    statistics = {name: Statistics(**values) for name, values in parts["statistics"].items()}
+    return experiment.assemble(config), {"params": parts["average"], "statistics": statistics}
+
+
+if __name__ == "__main__":
+    setup()
+    with fail_clearly():
+        main(sys.argv[1:])
