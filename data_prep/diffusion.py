@@ -1,0 +1,86 @@
+"""A body's skinning weights and shape directions carried over to a garment."""
+
+import igl
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.spatial import cKDTree
+
+from clothjax.types import Body
+from data_prep.mesh import edge_table
+
+INFLUENCES = 8  # joints that move a vertex, at most
+
+
+def diffuse(
+    points: np.ndarray,
+    faces: np.ndarray,
+    body: Body,
+    *,
+    samples: int = 0,
+    spread: float = 0.05,
+    hidden: np.ndarray | None = None,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Skinning weights [V, J] and shape directions [V, 3, S] for a garment around a body (HOOD's way).
+
+    Args:
+        points: [V, 3] m, in the body's canonical pose.
+        faces: [F, 3] of the garment.
+        body: to take the data from.
+        samples: 0 for tight garments: the data of the nearest point on the body's surface. For loose ones:
+            so many points are drawn around each, with sqrt(distance) as deviation, and the data of the body
+            vertices nearest to them are averaged.
+        spread: m, deviation of a blur over a tight garment, which would tear where the nearest jumps from
+            arm to trunk or leg to leg.
+        hidden: [B] bool, body vertices that give no data, such as hands beside the hips.
+        seed: of the samples.
+
+    Raises:
+        ValueError: if every body vertex is hidden.
+    """
+    usable = np.ones(len(body.vertices), bool) if hidden is None else ~hidden
+    if not usable.any():
+        raise ValueError("every vertex of the body is hidden: nothing to take the skinning from")
+    points, vertices = np.asarray(points, np.float64), np.asarray(body.vertices, np.float64)
+    shapedirs = np.reshape(body.shapedirs, (len(vertices), -1))
+    data = np.concatenate([body.weights, shapedirs], axis=1).astype(np.float64)
+    if samples:
+        mixed = _sampled(points, vertices[usable], data[usable], samples, seed)
+    else:
+        mixed = _nearest(points, vertices, np.asarray(body.faces, np.int64), usable, data)
+        mixed = _blur(mixed, points, np.asarray(faces), spread)
+    joints = body.weights.shape[1]
+    weights = np.clip(mixed[:, :joints], 0, None)
+    least_kept = np.sort(weights, axis=1)[:, -min(INFLUENCES, joints)][:, None]
+    weights = np.where(weights >= least_kept, weights, 0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    return weights.astype(np.float32), mixed[:, joints:].reshape(len(points), 3, -1).astype(np.float32)
+
+
+def _sampled(points, vertices, data, samples: int, seed: int) -> np.ndarray:
+    tree, rng = cKDTree(vertices), np.random.default_rng(seed)
+    deviation = np.sqrt(tree.query(points)[0])[:, None]
+    mixed = np.zeros((len(points), data.shape[1]))
+    for _ in range(samples):
+        mixed += data[tree.query(points + rng.normal(size=points.shape) * deviation)[1]]
+    return mixed / samples
+
+
+def _nearest(points, vertices, faces, usable, data) -> np.ndarray:
+    faces = faces[usable[faces].all(axis=1)]
+    _, face, foot = igl.point_mesh_squared_distance(points, vertices, faces)[:3]
+    corners = faces[face]
+    share = igl.barycentric_coordinates(foot, *(np.ascontiguousarray(vertices[c]) for c in corners.T))
+    return np.einsum("vk,vkd->vd", share, data[corners])
+
+
+def _blur(data: np.ndarray, points: np.ndarray, faces: np.ndarray, deviation: float) -> np.ndarray:
+    """Half steps towards the mean of the neighbours; each adds a quarter of an edge squared per axis."""
+    edges = edge_table(faces)[0]
+    square = np.mean(np.sum((points[edges[:, 0]] - points[edges[:, 1]]) ** 2, axis=1))
+    start, end = np.concatenate([edges, edges[:, ::-1]]).T
+    mean = coo_matrix((np.ones(len(start)), (start, end)), (len(points), len(points))).tocsr()
+    count = np.maximum(np.asarray(mean.sum(axis=1)), 1)
+    for _ in range(round(4 * deviation**2 / square)):
+        data = (data + (mean @ data) / count) / 2
+    return data

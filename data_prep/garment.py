@@ -1,0 +1,348 @@
+"""Garments built on a body, or taken from a mesh, with the body's skinning and shape diffused onto them.
+
+    python -m data_prep.garment --template tshirt --vertices 1000 --body body.h5 out.h5
+    python -m data_prep.garment --mesh shirt.obj --body body.h5 out.h5
+
+A template is an implicit solid around the body that is meshed, cut by planes, remeshed and pushed out of the
+body: an offset of the body's distance field, closed over armpits and crotch, and for what hangs the convex
+hulls of the body's slices.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import igl
+import numpy as np
+import tyro
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.spatial import ConvexHull
+
+from clothjax.storage import joint_names, load_body, save_garment
+from clothjax.types import Body, Garment
+from data_prep.diffusion import diffuse
+from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
+from data_prep.remesh import flip, relax, remesh
+from data_prep.retarget import cmu_names
+
+WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+CLEARANCE = 0.004  # m, kept between garment and body
+OFFSET = 0.012  # m, of the solid from the body
+CELL = 0.008  # m, of the distance field's grid
+FOREARM = ("ForeArm", "Hand", "Finger", "Thumb")  # what no template covers
+ARM = ("LeftArm", "RightArm", *FOREARM)
+
+
+@dataclass(frozen=True)
+class Template:
+    """A kind of garment. Heights are named places on the body (see `_landmarks`) and metres above them."""
+
+    hem: tuple[str, float]
+    loops: int  # openings
+    closing: float = 0.05  # m, radius of the hollows that are bridged
+    blur: float = 1.2  # grid cells
+    hull: tuple[str, float, float] | None = None  # what hangs: from where, how far above, flare in m per m
+    only_hull: bool = False
+    sleeve: float | None = None  # share of the upper arm
+    neck: float | None = None  # m the neckline is lowered
+    scoop: float | None = None  # m, depth of a neckline with bare shoulders
+    waist: bool = False  # ends at the waist and is pinned there
+    samples: int = 0  # for the diffusion: 0 for tight garments
+
+
+TEMPLATES = {
+    "tshirt": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=0.55, neck=0.015),
+    "tank": Template(("crotch", 0.02), 4, scoop=0.10),
+    "pants": Template(("ankle", 0.06), 3, closing=0.02, blur=1.0, waist=True),
+    "skirt": Template(
+        ("thigh", -0.05),
+        2,
+        closing=0,
+        blur=2.0,
+        hull=("waist", 0.06, 0.18),
+        only_hull=True,
+        waist=True,
+        samples=500,
+    ),
+    "dress": Template(
+        ("knee", 0.05), 4, blur=1.5, hull=("waist", 0.0, 0.22), sleeve=0.35, neck=0.02, samples=500
+    ),
+}
+
+
+class Wearer(NamedTuple):
+    """What a template needs of a body."""
+
+    vertices: np.ndarray  # [B, 3] m, float64
+    faces: np.ndarray  # [F, 3] int64
+    arms: np.ndarray  # [B] share of the skinning weights on the arms
+    joint: dict[str, np.ndarray]  # CMU's name: place [3]
+    level: dict[str, float]  # name: height in m
+
+
+class Grid(NamedTuple):
+    """A regular grid of cubic cells."""
+
+    origin: np.ndarray  # [3] m
+    shape: tuple[int, int, int]
+
+    def axis(self, k: int) -> np.ndarray:
+        """Coordinates along one axis."""
+        return self.origin[k] + CELL * np.arange(self.shape[k])
+
+
+def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed: int = 0) -> Garment:
+    """A garment of a template on a body, with about so many vertices (3 %).
+
+    Args:
+        template: one of TEMPLATES.
+        vertices: wanted.
+        body: watertight, in an A- or T-pose.
+        names: of its joints, CMU's or SMPL's.
+        seed: of the samples in the diffusion.
+
+    Raises:
+        ValueError: for an unknown template, joints that are missing, or a body on which the template fails.
+    """
+    if template not in TEMPLATES:
+        raise ValueError(f"there is no template {template!r}: choose one of {', '.join(TEMPLATES)}")
+    kind, wearer = TEMPLATES[template], _wearer(body, names)
+    solid, triangles = _solid(kind, wearer)
+    for distance in _cuts(kind, wearer):
+        solid, triangles = clip(solid, triangles, distance(solid))
+    solid, triangles = component(solid, triangles)
+    nearest = igl.signed_distance(solid, wearer.vertices, wearer.faces, sign_type=WINDING)[2]
+    if ((solid - nearest) * igl.per_vertex_normals(solid, triangles)).sum() < 0:
+        triangles = triangles[:, ::-1]
+
+    # equilateral triangles: two faces of sqrt(3)/4 h^2 for each vertex
+    length = np.sqrt(igl.doublearea(solid, triangles).sum() / vertices / np.sqrt(3))
+    shape, faces = remesh(solid, triangles, length, 6)
+    for _ in range(4):
+        if abs(len(shape) / vertices - 1) < 0.03:
+            break
+        length *= np.sqrt(len(shape) / vertices)
+        shape, faces = remesh(shape, faces, length, 3)
+    shape, faces = fit(shape, faces, wearer.vertices, wearer.faces)
+    if len(boundary_loops(faces)) != kind.loops or components(faces, len(shape)).max() > 0:
+        raise ValueError(
+            f"template {template!r} came out with {len(boundary_loops(faces))} openings, not {kind.loops}, "
+            "on this body: try another pose, or bring a mesh (--mesh)"
+        )
+    bare = ARM if kind.waist else FOREARM
+    return _dress(shape, faces, body, names, bare, kind.samples, kind.waist, seed)
+
+
+def fit(
+    vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The garment pushed out of the body: vertices by CLEARANCE, middles of edges and faces by half of it."""
+
+    def outward(points):
+        signed, _, foot = igl.signed_distance(points, body, triangles, sign_type=WINDING)[:3]
+        away = (points - foot) * np.sign(signed)[:, None]
+        return signed, away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+
+    for _ in range(4):
+        faces, _ = flip(vertices, faces)
+        border = boundary_mask(faces, len(vertices))[:, None]
+        vertices = np.where(border, vertices, 0.6 * vertices + 0.4 * relax(vertices, faces, 1))
+        for _ in range(6):
+            signed, away = outward(vertices)
+            if signed.min() >= CLEARANCE:
+                break
+            vertices = vertices + away * np.where(signed < CLEARANCE, 1.02 * CLEARANCE - signed, 0)[:, None]
+    groups = (faces, faces[:, :2], faces[:, 1:], faces[:, [2, 0]])
+    for _ in range(20):
+        signed, away = outward(np.concatenate([vertices[g].mean(axis=1) for g in groups]))
+        if signed.min() >= CLEARANCE / 2:
+            break
+        move, count = np.zeros_like(vertices), np.zeros(len(vertices))
+        wrong = (signed < CLEARANCE / 2).reshape(len(groups), -1)
+        for group, bad, direction in zip(groups, wrong, away.reshape(len(groups), -1, 3)):
+            for column in group[bad].T:
+                np.add.at(move, column, direction[bad])
+                np.add.at(count, column, 1)
+        vertices = vertices + CLEARANCE / 2 * move / np.maximum(count, 1)[:, None]
+    return vertices, faces
+
+
+def _dress(shape, faces, body, names, bare, samples, pin, seed) -> Garment:
+    parts = [any(part in name for part in bare) for name in cmu_names(names)]
+    hidden = np.asarray(body.weights)[:, parts].sum(axis=1) > 0.3
+    weights, shapedirs = diffuse(shape, faces, body, samples=samples, hidden=hidden, seed=seed)
+    pinned = np.zeros(len(shape), bool)
+    if pin:
+        pinned[max(boundary_loops(faces), key=lambda loop: shape[loop, 1].mean())] = True
+    return Garment(shape.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned)
+
+
+def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
+    known = cmu_names(names)
+    joint = {name: np.asarray(place, np.float64) for name, place in zip(known, body.joints)}
+    needed = {"Neck", "Hips", "LowerBack"} | {
+        side + bone for side in ("Left", "Right") for bone in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")
+    }
+    if needed - set(joint):
+        raise ValueError(
+            f"the body lacks the joints {sorted(needed - set(joint))}: name them as CMU or SMPL do"
+        )
+    vertices = np.asarray(body.vertices, np.float64)
+    tall = np.ptp(vertices[:, 1])
+    height = {name: place[1] for name, place in joint.items()}
+    level = {
+        "chest": height["Neck"] - 0.13 * tall,
+        "waist": height["Hips"] + 0.06 * tall,
+        "crotch": height["LeftUpLeg"] - 0.03 * tall,
+        "thigh": (height["LeftUpLeg"] + height["LeftLeg"]) / 2,
+        "knee": height["LeftLeg"],
+        "ankle": height["LeftFoot"],
+    }
+    parts = [any(part in name for part in ARM) for name in known]
+    arms = np.asarray(body.weights)[:, parts].sum(axis=1)
+    return Wearer(vertices, np.asarray(body.faces, np.int64), arms, joint, level)
+
+
+def _solid(kind: Template, wearer: Wearer) -> tuple[np.ndarray, np.ndarray]:
+    """Closed surface of the implicit garment, before it is cut."""
+    hem = wearer.level[kind.hem[0]] + kind.hem[1]
+    top = wearer.level["waist"] + 0.02 if kind.waist else wearer.joint["Neck"][1] + 0.12
+    reach = max(abs(wearer.joint[f"{side}ForeArm"][0]) for side in ("Left", "Right")) + 0.05
+    width = max(0.45 if kind.hull else 0.4, 0 if kind.waist else reach)
+    deep = 0.27 if kind.hull else 0.12
+    low = np.array([-width, hem - 0.05, wearer.vertices[:, 2].min() - deep])
+    high = np.array([width, top + 0.05, wearer.vertices[:, 2].max() + deep])
+    grid = Grid(low, tuple(int(n) + 1 for n in np.ceil((high - low) / CELL)))
+    points = np.stack(np.meshgrid(*(grid.axis(k) for k in range(3)), indexing="ij"), axis=-1)
+    if kind.only_hull:
+        field = _hang(kind, wearer, grid, hem)
+    else:
+        flat = points.reshape(-1, 3)
+        field = igl.signed_distance(flat, wearer.vertices, wearer.faces, sign_type=WINDING)[0]
+        field = _closed(field.reshape(grid.shape) - OFFSET, kind.closing)
+        if kind.hull:
+            field = np.minimum(field, _hang(kind, wearer, grid, hem))
+    field = gaussian_filter(np.clip(field, -0.05, 0.05), kind.blur)
+    values = np.ascontiguousarray(field.transpose(2, 1, 0)).reshape(-1)  # x runs fastest, as igl wants it
+    places = np.ascontiguousarray(points.transpose(2, 1, 0, 3)).reshape(-1, 3)
+    vertices, faces = igl.marching_cubes(values, places, *grid.shape, 0.0)[:2]
+    return component(vertices, faces, wearer.joint["Hips" if kind.waist else "LowerBack"])
+
+
+def _closed(field: np.ndarray, radius: float) -> np.ndarray:
+    """The solid `field` < 0 grown by a radius and shrunk again: bridges armpits, cleavage, crotch."""
+    if radius == 0:
+        return field
+    inward = distance_transform_edt(field <= radius) * CELL
+    outward = distance_transform_edt(field > radius) * CELL
+    grown = np.where(field <= radius, -(inward - CELL / 2), outward - CELL / 2)
+    return np.minimum(field, grown + radius)
+
+
+def _hang(kind: Template, wearer: Wearer, grid: Grid, hem: float) -> np.ndarray:
+    """Implicit solid of what hangs: hulls of the body's slices and all above them, with a flare."""
+    place, above, flare = kind.hull
+    top = wearer.level[place] + above
+    trunk = wearer.vertices[wearer.arms < 0.3]
+    x, z = np.meshgrid(grid.axis(0), grid.axis(2), indexing="ij")
+    field, outline = np.full(grid.shape, 1.0), np.zeros((0, 2))
+    for i, y in reversed(list(enumerate(grid.axis(1)))):
+        if not hem - 0.03 - 3 * CELL <= y <= top:
+            continue
+        outline = np.concatenate([outline, trunk[np.abs(trunk[:, 1] - y) < 1.5 * CELL][:, [0, 2]]])
+        if len(outline) < 3:
+            continue
+        hull = ConvexHull(outline)
+        outline = outline[hull.vertices]
+        distance = np.max([a * x + b * z + c for a, b, c in hull.equations], axis=0)
+        field[:, i] = distance - OFFSET - flare * (top - y)
+    return field
+
+
+def _cuts(kind: Template, wearer: Wearer) -> list[Callable[[np.ndarray], np.ndarray]]:
+    """Functions of points [V, 3] that are > 0 where the solid is cut away."""
+    hem, waist = wearer.level[kind.hem[0]] + kind.hem[1], wearer.level["waist"]
+    neck, joint = wearer.joint["Neck"], wearer.joint
+    broad = abs(joint["LeftArm"][0] - joint["RightArm"][0])
+    cuts = [lambda x: hem - x[:, 1]]
+    if kind.waist:
+        cuts.append(lambda x: x[:, 1] - waist)
+    if kind.sleeve is not None:
+        for side in ("Left", "Right"):
+            shoulder, along = joint[f"{side}Arm"], joint[f"{side}ForeArm"] - joint[f"{side}Arm"]
+            end, along = shoulder + kind.sleeve * along, along / np.linalg.norm(along)
+            cuts.append(_beyond_plane(end, along, within=0.16))
+    if kind.neck is not None:
+        base, up = neck + np.array([0, 0.02 - kind.neck, 0]), np.array([0, 1, 0.35]) / np.hypot(1, 0.35)
+        radius = 0.42 * broad
+        cuts.append(
+            lambda x: np.minimum((x - base) @ up, radius - np.hypot(x[:, 0] - base[0], x[:, 2] - base[2]))
+        )
+    if kind.scoop is not None:
+        for side, sign in (("Left", 1), ("Right", -1)):
+            away = np.array([sign, 0.25, 0]) / np.hypot(1, 0.25)
+            cuts.append(_beyond_plane(joint[f"{side}Arm"] - [sign * 0.015, 0, 0], away))
+        middle, wide = neck + np.array([0, 0.01, 0]), 0.34 * broad
+        cuts.append(
+            lambda x: (
+                0.05
+                - 0.05 * ((x[:, 0] - middle[0]) / wide) ** 2
+                - 0.05 * ((x[:, 1] - middle[1]) / kind.scoop) ** 2
+            )
+        )
+    return cuts
+
+
+def _beyond_plane(
+    point: np.ndarray, normal: np.ndarray, within: float = np.inf
+) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda x: np.where(np.linalg.norm(x - point, axis=1) < within, (x - point) @ normal, -1.0)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Makes a garment for a body, from a template or from a mesh that already fits it."""
+
+    output: tyro.conf.Positional[Path]
+    template: Literal["tshirt", "tank", "pants", "skirt", "dress"] = "tshirt"
+    vertices: int = 1000
+    mesh: Path | None = None
+    """A triangle mesh (.obj, .ply, .off, .stl) in metres around the canonical body; instead of a template."""
+    loose: bool = False
+    """For a mesh: diffuse by samples around each vertex, as for skirts."""
+    pin: bool = False
+    """For a mesh: pin its highest opening."""
+    body: str = "body"
+    """File of the body, or the name of the embedded one."""
+    licence: str = "CC0-1.0"
+    seed: int = 0
+
+
+def main(args: Arguments) -> None:
+    """Writes the file the arguments ask for."""
+    body, names = load_body(args.body), joint_names(args.body)
+    if args.mesh is None:
+        garment = build(args.template, args.vertices, body, names, args.seed)
+        source = f"python -m data_prep.garment --template {args.template} --vertices {args.vertices}"
+    else:
+        if not args.mesh.is_file():
+            raise ValueError(f"{args.mesh}: no such file")
+        shape, faces = igl.read_triangle_mesh(str(args.mesh))
+        if not len(faces):
+            raise ValueError(f"{args.mesh}: no triangles; export the mesh as triangles")
+        garment = _dress(shape, faces, body, names, (), 500 if args.loose else 0, args.pin, args.seed)
+        source = args.mesh.name
+    save_garment(
+        args.output,
+        garment,
+        name=args.output.stem,
+        body=Path(args.body).stem,
+        source=source,
+        licence=args.licence,
+    )
+    print(f"{args.output}: {len(garment.vertices)} vertices, {int(garment.pinned.sum())} pinned")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

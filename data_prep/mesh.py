@@ -1,0 +1,78 @@
+"""Plain operations on triangle meshes: edges, boundary, connected parts, cutting."""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+
+def edge_table(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges [E, 2] with ascending ends, the edges ab, bc, ca of each face [F, 3], faces at each edge [E]."""
+    halves = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    size = int(halves.max()) + 1
+    code, of_face, count = np.unique(
+        halves[:, 0] * size + halves[:, 1], return_inverse=True, return_counts=True
+    )
+    return np.stack([code // size, code % size], axis=1), of_face.reshape(-1, 3), count
+
+
+def boundary_mask(faces: np.ndarray, count: int) -> np.ndarray:
+    """Whether each of `count` vertices is on the boundary."""
+    edges, _, sharing = edge_table(faces)
+    mask = np.zeros(count, bool)
+    mask[edges[sharing == 1].ravel()] = True
+    return mask
+
+
+def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """The vertices of each opening."""
+    edges, _, count = edge_table(faces)
+    border = edges[count == 1]
+    label = components(border, int(faces.max()) + 1)
+    used = np.unique(border)
+    return [used[label[used] == k] for k in np.unique(label[used])]
+
+
+def components(links: np.ndarray, count: int) -> np.ndarray:
+    """Label [count] of the connected part each vertex is in, from faces or edges."""
+    a, b = links[:, :-1].ravel(), links[:, 1:].ravel()
+    return connected_components(coo_matrix((np.ones(len(a)), (a, b)), (count, count)), directed=False)[1]
+
+
+def component(
+    vertices: np.ndarray, faces: np.ndarray, near: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The connected part with most faces, or the one with the vertex nearest to a point [3]."""
+    label = components(faces, len(vertices))
+    wanted = np.bincount(label[faces[:, 0]]).argmax()
+    if near is not None:
+        used = np.unique(faces)
+        wanted = label[used[((vertices[used] - near) ** 2).sum(axis=1).argmin()]]
+    return compact(vertices, faces[label[faces[:, 0]] == wanted])
+
+
+def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without its unused vertices."""
+    used, index = np.unique(faces, return_inverse=True)
+    return vertices[used], index.reshape(faces.shape)
+
+
+def clip(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a mesh where `distance` [V] is <= 0; new vertices keep 2 % away from an edge's ends."""
+    distance = np.where(np.abs(distance) < 1e-9, -1e-9, distance)
+    edges = edge_table(faces)[0]
+    edges = edges[(distance[edges[:, 0]] > 0) != (distance[edges[:, 1]] > 0)]
+    start, end = edges.T
+    share = np.clip(distance[start] / (distance[start] - distance[end]), 0.02, 0.98)[:, None]
+    cut = {(int(a), int(b)): len(vertices) + i for i, (a, b) in enumerate(edges)}
+    vertices = np.concatenate([vertices, vertices[start] * (1 - share) + vertices[end] * share])
+    inside = distance[faces] <= 0
+    count = inside.sum(axis=1)
+    kept = faces[count == 3].tolist()
+    for face, within in zip(faces.tolist(), inside):
+        if within.sum() not in (1, 2):
+            continue
+        odd = int(np.argmax(within)) if within.sum() == 1 else int(np.argmin(within))
+        a, b, c = (face[(odd + k) % 3] for k in range(3))
+        x, y = cut[min(a, b), max(a, b)], cut[min(a, c), max(a, c)]
+        kept += [[a, x, y]] if within.sum() == 1 else [[b, c, y], [b, y, x]]
+    return compact(vertices, np.array(kept, int).reshape(-1, 3))
