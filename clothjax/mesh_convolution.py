@@ -132,4 +132,4 @@ def _basis_first(inputs: int, outputs: int, slots: int, features: int, channels:
 
 
 def _gather(x: Array, ids: Array) -> Array:
-    return x.at[ids].get(mode="promise_in_bounds")
+    return jnp.asarray(x).at[ids].get(mode="promise_in_bounds")
