@@ -132,20 +132,25 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
     Raises:
         ValueError: if there is no undamaged checkpoint, or it has no such part.
     """
-    about = latest(directory)
-    like: dict = {part: {} for part in parts}
-    for name, leaf in about.leaves.items():
-        *path, last = name.split("/")
-        if path and path[0] in parts:
-            node = like
-            for key in path:
-                node = node.setdefault(key, {})
-            node[last] = jax.ShapeDtypeStruct(tuple(leaf["shape"]), leaf["dtype"])
-    empty = [part for part in parts if not like[part]]
-    if empty:
-        raise ValueError(f"{about.path}: no {', '.join(empty)} in this checkpoint; it is of another kind of training")
-    found, about = restore_parts(directory, {part: _lists(like[part]) for part in parts}, step=about.step)
-    return found, about
+
+    def read_one(path: Path) -> tuple[dict[str, Any], Checkpoint]:
+        about = _about(path)
+        like: dict = {part: {} for part in parts}
+        for name, leaf in about.leaves.items():
+            *above, last = name.split("/")
+            if above and above[0] in parts:
+                node = like
+                for key in above:
+                    node = node.setdefault(key, {})
+                node[last] = jax.ShapeDtypeStruct(tuple(leaf["shape"]), leaf["dtype"])
+        empty = [part for part in parts if not like[part]]
+        if empty:
+            raise ValueError(f"{path}: has no {', '.join(empty)}; it is of another kind of training")
+        like = _lists(like)
+        leaves = _leaves(about, _named(like))
+        return jax.tree.unflatten(jax.tree.structure(like), leaves.values()), about
+
+    return _newest(Path(directory).resolve(), None, read_one)
 
 
 def _lists(tree: Any) -> Any:

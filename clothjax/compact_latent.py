@@ -46,7 +46,8 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
     size = left * per_vertex
     params = {}
     if config.latent_update == "descent":
-        params["descent"] = jnp.zeros((size, size))
+        zero = jnp.zeros((size, size))
+        params["descent"] = {"inverse_hessian": zero, "correction": zero}
     if channels is not None:
         # a change of the code starts small, a code starts at unit size
         params["latent"] = init_dense(keys[7], channels, per_vertex, gain=1e-4 if params else 1.0)
@@ -63,7 +64,6 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
 def init_statistics(example: Features) -> dict[str, Statistics]:
     """Empty statistics for features like `example`."""
     columns = {"nodes": example.nodes, "mesh": next(iter(example.edges.values())), "world": example.to_garment}
-    columns |= {"force": example.force_size}
     return {name: feature.empty_statistics(rows.shape[-1]) for name, rows in columns.items()}
 
 
@@ -77,7 +77,6 @@ def observe(statistics: dict[str, Statistics], seen: Features, limit: int) -> di
         "nodes": feature.observe(statistics["nodes"], rows(seen.nodes, seen.body), limit),
         "mesh": feature.observe(statistics["mesh"], rows(*seen.edges.values()), limit),
         "world": feature.observe(statistics["world"], rows(seen.to_garment, seen.to_body), limit),
-        "force": feature.observe(statistics["force"], rows(seen.force_size), limit),
     }
 
 
@@ -128,16 +127,29 @@ def encode(
     return processed.reshape(-1)
 
 
-def descend(params: Params, latent: Array, code: Array, code_force: Array, statistics: Statistics) -> Array:
-    """The next latent code [L]: the current one, moved along a learned map of the force on it, and by the network.
+def descend(params: Params, latent: Array, code: Array, force: Array, stiffness: Array, config: ModelConfig) -> Array:
+    """The next latent code [L]: the current one, moved down the potential and by the network.
 
-    The Hessian of the potential in the space of codes hardly changes, so one matrix can learn its inverse, and the
-    step is then close to Newton's. The force's size spans decades (a collision, a rest): it is compressed.
+    The Hessian of the potential in the space of codes hardly changes, so its inverse at rest, corrected by a learned
+    matrix, turns the force on Z [L] into nearly a Newton step. It scales with the cloth's `stiffness` over the
+    configured one's. Deep collisions push thousands of times harder than the rest: the step is bounded.
     """
-    size = jnp.sqrt(jnp.sum(code_force * code_force) + 1e-20)
-    ratio = size / jnp.exp(statistics.mean[0])
-    compressed = code_force * (jnp.arcsinh(ratio) / size)
-    return latent + compressed @ params["descent"] + code
+    descent = params["descent"]
+    push = config.descent_rate / stiffness * (force @ jax.lax.stop_gradient(descent["inverse_hessian"]))
+    push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / config.descent_bound**2)
+    return latent + push + push @ descent["correction"] + code
+
+
+def inverse_hessian(potential: Callable[[Array], Array], garment: Params, size: int, config: ModelConfig) -> Array:
+    """The inverse Hessian [L, L] in 1/J of a potential of canonical displacements [V, 3] m, over codes near zero."""
+    free = jnp.ones(garment["blendshapes"].shape[1])
+
+    def energy(latent):
+        return potential(garment_model.displacement(garment, latent, free, config))
+
+    values, vectors = jnp.linalg.eigh(jax.hessian(energy)(jnp.zeros(size)))
+    inverse = 1.0 / (jnp.maximum(values, 0.0) + config.descent_damping)
+    return (vectors * inverse[None]) @ vectors.T
 
 
 def step(
@@ -172,11 +184,13 @@ def step(
     force = -jax.grad(potential)(held)
     code_force = jax.lax.stop_gradient(pullback(force)[0] if descent else jnp.zeros_like(state.latent))
     seen = feature.features(
-        scene, character, state, window, contact, nearest_vertex, timestep, held, force, code_force, model, material
+        scene, character, state, window, contact, nearest_vertex, timestep, held, force, model, material
     )
     seen = jax.lax.stop_gradient(seen)
     code = encode(params, statistics, scene, seen, model)
-    latent = descend(params, state.latent, code, code_force, statistics["force"]) if descent else code
+    cloth = character.material
+    stiffness = (2 * cloth.mu + cloth.lam) / (2 * material.mu + material.lam)
+    latent = descend(params, state.latent, code, code_force, stiffness, model) if descent else code
     return garment(latent), latent, seen
 
 

@@ -125,11 +125,20 @@ class ModelConfig:
     latent: int = 240
     """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
     latent_update: Literal["absolute", "descent"] = "descent"
-    """Whether the network gives Z as in the thesis, or its change from the current frame's Z. The change then starts
-    from a learned linear map of the force on Z, the potential's gradient where the garment would be if held."""
+    """Whether the network gives Z as in the thesis, or its change from the current frame's Z. The change then has a
+    second part: part of a Newton step on the potential, from where the garment would be if held."""
+    descent_rate: float = 0.5
+    """Of that Newton step, at the start of training; a learned matrix corrects it."""
+    descent_damping: float = 0.1
+    """J, added to the Hessian of unit codes: folds are stiffer than the rest shape."""
+    descent_bound: float = 1.0
+    """Length of the step in Z that it cannot exceed."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
-    blendshapes: int = 128
+    decoder_skip: bool = True
+    """Adds a linear map of Z to the decoder's output, which the thesis has not. Narrow ReLU layers alone leave the
+    blend-shape weights few directions to move in."""
+    blendshapes: int = 192
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
     normalizer_steps: int = 2000

@@ -33,7 +33,6 @@ class Features(NamedTuple):
     to_body: Array  # [V, W] the same pair in the other direction
     slots: Array  # [V] int32, the body slot of each garment vertex
     active: Array  # [V] bool, whether the pair is close enough to count
-    force_size: Array  # [1, 1] logarithm of the norm of the force on the latent code
 
 
 def features(
@@ -46,7 +45,6 @@ def features(
     timestep: Array,
     held: Array,
     force: Array,
-    code_force: Array,
     model: ModelConfig,
     material: MaterialConfig,
 ) -> Features:
@@ -58,7 +56,6 @@ def features(
         timestep: s.
         held: [V, 3] m, the next positions if the canonical displacement were kept.
         force: [V, 3] N on the garment there, minus the potential's gradient.
-        code_force: [L], the same force on the latent code.
     """
     current, following = window.current, window.following
     turn = current.heading.T
@@ -122,8 +119,7 @@ def features(
         for sign in (1.0, -1.0)
     )
     active = jnp.sum(offset_now * offset_now, axis=-1) <= model.body_radius**2
-    force_size = 0.5 * jnp.log(jnp.sum(code_force * code_force) + 1e-20).reshape(1, 1)
-    return Features(garment, body, edges, to_garment, to_body, slots, active, force_size)
+    return Features(garment, body, edges, to_garment, to_body, slots, active)
 
 
 def material_inputs(material: Material, config: MaterialConfig) -> Array:

@@ -16,15 +16,21 @@ def init(key: Array, latent: int, basis: Array, config: ModelConfig) -> Params:
     A decoder of ordinary size would start the garment metres away: 4e4 J instead of a skinned garment's few.
     """
     sizes = (latent, *config.decoder, basis.shape[0])
-    return {
+    params = {
         "decoder": init_mlp(key, sizes, norm=False, last_gain=4e-4),
         "blendshapes": jnp.asarray(basis),
     }
+    if config.decoder_skip:
+        # each weight starts as one entry of the code
+        params["skip"] = jnp.eye(latent, basis.shape[0])
+    return params
 
 
 def blend_weights(params: Params, latent: Array, config: ModelConfig) -> Array:
     """Blend-shape weights [K] of a latent code [L]."""
     weights = mlp(params["decoder"], latent)
+    if config.decoder_skip:
+        weights = weights + latent @ params["skip"]
     return nn.relu(weights) if config.blendshape_relu else weights
 
 

@@ -16,7 +16,7 @@ from clothjax.config import Config, Range
 from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.scene import Scene, laplacian_basis
-from clothjax.types import Array, ClothState, Material
+from clothjax.types import Array, ClothState, Contact, Material
 
 
 class Simulation(NamedTuple):
@@ -110,6 +110,10 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
     example = example_features(scene, clips, config)
     params = compact_latent.init(model_key, scene, example, 0.1 * basis, config.model)
+    if config.model.latent_update == "descent":
+        params["descent"]["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(
+            params["garment"]
+        )
     pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(
         jax.random.split(pool_key, config.stage1.pool)
     )
@@ -122,6 +126,31 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
         statistics=compact_latent.init_statistics(example),
         pool=pool,
     )
+
+
+def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
+    """The inverse Hessian [L, L] of a time step of the configured cloth in the canonical pose, touching nothing."""
+    character = characters.dress(
+        scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
+    )
+    rest = character.template
+    away = jnp.zeros_like(rest).at[:, 1].set(-1.0)
+    step = losses.TimeStep(
+        position=rest,
+        velocity=jnp.zeros_like(rest),
+        mass=character.mass,
+        rest=character.rest,
+        material=character.material,
+        contact=Contact(away, away, -away, -away, jnp.zeros(len(rest), jnp.int32)),
+        touching=jnp.zeros(len(rest), bool),
+        timestep=jnp.float32(1.0 / config.fps),
+    )
+    left, channels = compact_latent.latent_size(scene, config.model)
+
+    def potential(displacement):
+        return losses.potential(rest + displacement, step, scene.mesh, config.physics)
+
+    return compact_latent.inverse_hessian(potential, garment, left * channels, config.model)
 
 
 def physical_stiffness(config: Config) -> float:
@@ -141,7 +170,7 @@ def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
         return compact_latent.feature.features(
             scene, character, simulation.cloth, window, planes, planes.index, jnp.float32(1.0 / config.fps),
             simulation.cloth.position, simulation.cloth.position,
-            simulation.cloth.latent, config.model, config.material,
+            config.model, config.material,
         )  # fmt: skip
 
     return jax.eval_shape(features, jax.random.key(0))

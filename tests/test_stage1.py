@@ -1,0 +1,144 @@
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import assert_same, shrink, small
+
+from clothjax import character as characters
+from clothjax import clips, configuration, experiment, fit, losses, rollout, stage1
+from clothjax.config import Config
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def toy():
+    config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
+    whole = experiment.assemble(config)
+    reel, _ = experiment.training_clips(whole)
+    return whole, reel
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=[path.stem for path in CONFIGS])
+def test_every_configuration_takes_two_steps(path):
+    config = shrink(configuration.load(Config, path))
+    config = dataclasses.replace(config, motions=("walk_0",))
+    whole = experiment.assemble(config)
+    reel, _ = experiment.training_clips(whole)
+    state = stage1.init(whole.scene, reel, config)
+    before = jax.device_get(state.params)
+    state, metrics = stage1.make_curriculum(whole.scene, reel, config, 2)(state)
+    assert int(state.step) == 2
+    assert np.isfinite(metrics["loss"]).all() and not metrics["nonfinite"].any()
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params)))
+
+
+def test_a_killed_and_resumed_training_ends_bit_for_bit_like_one_that_was_not(toy, tmp_path):
+    whole, reel = toy
+    config = whole.config
+    update = stage1.make_curriculum(whole.scene, reel, config, 10)
+
+    def run(folder, steps):
+        state = stage1.init(whole.scene, reel, config)
+        kept = configuration.to_dict(config)
+        return fit.fit(update, state, steps=steps, steps_per_call=10, directory=tmp_path / folder, config=kept).state
+
+    straight = run("straight", 40)
+    run("stopped", 20)
+    resumed = run("stopped", 40)
+    assert_same(straight.params, resumed.params)
+    assert_same(straight.pool, resumed.pool)
+    assert int(resumed.step) == 40
+
+
+def test_training_lowers_the_loss_it_is_given(toy):
+    whole, reel = toy
+    config = dataclasses.replace(whole.config, stage1=dataclasses.replace(whole.config.stage1, steps=400))
+    update = stage1.make_curriculum(whole.scene, reel, config, 100)
+    state = stage1.init(whole.scene, reel, config)
+    medians = []
+    for _ in range(4):
+        state, metrics = update(state)
+        medians.append(float(jnp.median(metrics["loss"])))
+    assert medians[-1] < 0.8 * medians[0]
+
+
+def test_a_step_with_a_nonfinite_gradient_changes_nothing_but_its_count(toy):
+    whole, reel = toy
+    state = stage1.init(whole.scene, reel, whole.config)
+    broken = state._replace(pool=state.pool._replace(betas=state.pool.betas.at[0].set(jnp.nan)))
+    before = jax.device_get((broken.params, broken.average, broken.optimizer, broken.statistics))
+    after, metrics = stage1.make_update(whole.scene, reel, whole.config, 1, 1)(broken)
+    assert metrics["nonfinite"][0]
+    assert_same(before, (after.params, after.average, after.optimizer, after.statistics))
+
+
+def _play(whole, reel, params, motion, advance_turn):
+    scene, config = whole.scene, whole.config
+    moved = motion._replace(
+        rotations=np.concatenate([np.einsum("ab,tbc->tac", advance_turn, motion.rotations[:, 0])[:, None],
+                                  motion.rotations[:, 1:]], axis=1).astype(np.float32),
+    )  # fmt: skip
+    poses = jax.tree.map(jnp.asarray, experiment.windows(moved))
+    poses = jax.vmap(lambda t: clips.poses(poses, t))(jnp.arange(1, 20))
+    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
+    new, _, _ = rollout.play(params, scene, character, poses, config)
+    return np.asarray(new), np.asarray(character.joints[0])
+
+
+def test_phi_does_not_see_place_or_heading(toy):
+    whole, reel = toy
+    state = stage1.init(whole.scene, reel, whole.config)
+    state, _ = stage1.make_update(whole.scene, reel, whole.config, 1, 20)(state)
+    model = {"params": state.params, "statistics": state.statistics}
+    motion = experiment.motion(whole, "walk_0")
+    angle = 1.1
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    plain, root = _play(whole, reel, model, motion, np.eye(3))
+    far = motion._replace(translation=motion.translation + np.array([1000.0, 0.0, -500.0]))
+    elsewhere, _ = _play(whole, reel, model, far, np.eye(3))
+    np.testing.assert_allclose(elsewhere, plain, atol=2e-5)
+    turned = motion._replace(translation=motion.translation @ turn.T)
+    heading, _ = _play(whole, reel, model, turned, turn)
+    # the root joint, about which the body turns, is not at the origin
+    np.testing.assert_allclose(heading - root, (plain - root) @ turn.T, atol=2e-4)
+
+
+def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
+    whole, reel = toy
+    config, scene = whole.config, whole.scene
+    state = stage1.init(scene, reel, config)
+    reel = jax.tree.map(jnp.asarray, reel)
+    one = jax.tree.map(lambda x: x[0], state.pool)
+    character = characters.dress(scene, one.betas, one.material, config.physics)
+    _, (cloth, terms, _) = rollout.training_rollout(
+        state.params, state.statistics, scene, character, one.cloth, reel, one.frame, jnp.asarray(True),
+        state.step, 1, config,
+    )  # fmt: skip
+    window = characters.window(scene, character, clips.poses(reel, one.frame), config.physics)
+    skinned = characters.skinned(character, window.current)
+    # an untrained network hardly moves the cloth: it stays where it was skinned and keeps the body's velocity
+    assert float(jnp.max(jnp.linalg.norm(cloth.position - skinned, axis=-1))) < 0.02
+    np.testing.assert_array_equal(cloth.velocity, one.cloth.velocity)
+    assert set(terms) == set(losses.TERMS)
+
+
+def test_the_rollout_grows_with_the_curriculum():
+    config = Config(stage1=dataclasses.replace(Config().stage1, rollout=1, rollout_end=5, rollout_every=5000))
+    assert [stage1.rollout_length(step, config) for step in (0, 4999, 5000, 20000, 10**6)] == [1, 1, 2, 5, 5]
+
+
+def test_materials_are_drawn_from_their_ranges():
+    config = Config()
+    drawn = jax.vmap(lambda key: stage1.sample_material(key, config))(jax.random.split(jax.random.key(0), 500))
+    for values, limits in zip(
+        drawn,
+        (config.material.density_range, config.material.mu_range, config.material.lam_range,
+         config.material.bending_range),
+    ):  # fmt: skip
+        assert limits.low <= float(values.min()) and float(values.max()) <= limits.high
+    # bending spans four decades evenly
+    assert 0.4 < float(jnp.mean(drawn.bending < np.sqrt(6.37e-8 * 1.31e-3))) < 0.6
