@@ -1,0 +1,193 @@
+"""Vertices over time as pictures and animations: ray-cast on the CPU, no graphics driver needed. NumPy only."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+SKIN, CLOTH, FLOOR, SKY = (0.86, 0.70, 0.60), (0.23, 0.42, 0.72), (0.93, 0.93, 0.92), (0.97, 0.975, 0.98)
+KEY_LIGHT = np.array([0.45, 0.8, 0.55])
+FILL_LIGHT = np.array([-0.7, 0.25, 0.5])
+
+
+class Surface(NamedTuple):
+    """A triangle mesh at one moment."""
+
+    vertices: np.ndarray  # [N, 3] m
+    faces: np.ndarray  # [F, 3]
+    colour: tuple[float, float, float] = CLOTH
+
+
+class Camera(NamedTuple):
+    """Where a picture is taken from."""
+
+    eye: np.ndarray  # [3] m
+    target: np.ndarray  # [3] m
+    height: float  # m seen at the target
+
+
+def camera_for(vertices: np.ndarray, view: str = "three-quarter", margin: float = 1.12) -> Camera:
+    """A camera that sees all of [..., 3] m, from the `front`, the `back`, the `side` or `three-quarter`s."""
+    angles = {"front": 0.0, "three-quarter": 0.6, "side": np.pi / 2, "back": np.pi}
+    if view not in angles:
+        raise ValueError(f"view {view!r} is not one of {sorted(angles)}")
+    points = np.asarray(vertices, np.float64).reshape(-1, 3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    target = 0.5 * (low + high)
+    height = margin * (high[1] - low[1])
+    away = np.array([np.sin(angles[view]), 0.12, np.cos(angles[view])])
+    return Camera(target + 4.0 * height * away / np.linalg.norm(away), target, height)
+
+
+def render(
+    surfaces: Sequence[Surface],
+    camera: Camera,
+    size: tuple[int, int] = (360, 480),
+    *,
+    floor: float | None = None,
+    samples: int = 2,
+) -> np.ndarray:
+    """A lit picture [h, w, 3] uint8 of surfaces, smooth-shaded, with shadows.
+
+    Visibility is by ray casting, so skin shows through cloth only where it really does.
+
+    Args:
+        size: width and height in pixels.
+        floor: height in m of a floor to stand on, if any.
+        samples: per pixel side.
+
+    Raises:
+        ImportError: if embreex is not installed (`pip install clothjax[render]`).
+    """
+    scene_type, mesh_type = _embree()
+    scene = scene_type()
+    normals, offset, colours = [], [], []
+    for surface in surfaces:
+        vertices = np.ascontiguousarray(surface.vertices, np.float32)
+        mesh_type(scene, vertices, np.ascontiguousarray(surface.faces, np.int32))
+        normals.append(vertex_normals(vertices, surface.faces))
+        offset.append(surface.faces)
+        colours.append(surface.colour)
+    width, height = size[0] * samples, size[1] * samples
+    origins, directions = _rays(camera, width, height)
+    hit = scene.run(origins, directions, query="INTERSECT", output=1)
+    colour = np.tile(np.asarray(SKY, np.float32), (len(origins), 1))
+    struck = hit["primID"] >= 0
+    points = np.zeros_like(origins)
+    normal = np.zeros_like(origins)
+    base = np.zeros_like(origins)
+    for index, faces in enumerate(offset):
+        chosen = np.flatnonzero(struck & (hit["geomID"] == index))
+        corners = np.asarray(faces)[hit["primID"][chosen]]
+        u, v = hit["u"][chosen, None], hit["v"][chosen, None]
+        blend = (1 - u - v, u, v)
+        normal[chosen] = sum(w * normals[index][corners[:, k]] for k, w in enumerate(blend))
+        points[chosen] = sum(
+            w * np.asarray(surfaces[index].vertices, np.float32)[corners[:, k]] for k, w in enumerate(blend)
+        )
+        base[chosen] = colours[index]
+    # both sides of cloth are seen; its inside a little darker
+    behind = np.sum(normal * directions, axis=1) > 0
+    base[behind & struck] *= 0.75
+    normal[behind] *= -1
+    if floor is not None:
+        distance = (floor - origins[:, 1]) / np.where(directions[:, 1] < -1e-6, directions[:, 1], -1e-6)
+        on_floor = ~struck & (directions[:, 1] < -1e-6) & (distance > 0)
+        points[on_floor] = origins[on_floor] + distance[on_floor, None] * directions[on_floor]
+        normal[on_floor], base[on_floor] = (0, 1, 0), FLOOR
+    else:
+        on_floor = np.zeros(len(origins), bool)
+    lit = np.flatnonzero(struck | on_floor)
+    shade = _shade(scene, points[lit], normal[lit], base[lit])
+    if on_floor.any():
+        # the floor fades into the sky away from its subject
+        spread = np.linalg.norm(points[lit][:, [0, 2]] - camera.target[[0, 2]], axis=1)
+        fade = np.clip(spread / (2.2 * camera.height), 0, 1)[:, None] * on_floor[lit][:, None]
+        shade = shade * (1 - fade) + np.asarray(SKY) * fade
+    colour[lit] = shade
+    picture = colour.reshape(size[1], samples, size[0], samples, 3).mean(axis=(1, 3))
+    return (255 * np.clip(picture, 0, 1) ** (1 / 1.15) + 0.5).astype(np.uint8)
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted unit normals [N, 3]."""
+    corners = np.asarray(vertices)[np.asarray(faces)]
+    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    summed = np.zeros((len(vertices), 3), np.float32)
+    for k in range(3):
+        np.add.at(summed, np.asarray(faces)[:, k], face)
+    return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
+
+
+def comparison(path: str | Path, rows: dict[str, Sequence[np.ndarray]], columns: Sequence[str]) -> None:
+    """A labelled grid of pictures of one size as a PNG: one row a method, one column a moment."""
+    image, draw, font = _pillow("Image", "ImageDraw", "ImageFont")
+    height, width = next(iter(rows.values()))[0].shape[:2]
+    left, top = 150, 40
+    sheet = image.new("RGB", (left + width * len(columns), top + height * len(rows)), "white")
+    pen, letters = draw.Draw(sheet), font.load_default(20)
+    for c, label in enumerate(columns):
+        pen.text((left + width * (c + 0.5), top / 2), label, fill="black", font=letters, anchor="mm")
+    for r, (label, pictures) in enumerate(rows.items()):
+        pen.text((left - 12, top + height * (r + 0.5)), label, fill="black", font=letters, anchor="rm")
+        for c, picture in enumerate(pictures):
+            sheet.paste(image.fromarray(picture), (left + width * c, top + height * r))
+    sheet.save(path)
+
+
+def webp(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int = 82) -> None:
+    """An animated WebP of pictures [h, w, 3] uint8, endlessly repeated."""
+    (image,) = _pillow("Image")
+    pictures = [image.fromarray(frame) for frame in frames]
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0, quality=quality, method=4
+    )
+
+
+def _shade(scene, points: np.ndarray, normal: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Key light with shadow, fill light, light from the sky."""
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    key, fill = (light / np.linalg.norm(light) for light in (KEY_LIGHT, FILL_LIGHT))
+    toward = np.tile(key.astype(np.float32), (len(points), 1))
+    start = (points + 4e-3 * normal).astype(np.float32)  # clear of the surface the point is on
+    shadow = scene.run(start, toward, query="OCCLUDED")
+    seen = (np.asarray(shadow) < 0).astype(np.float32) if shadow.dtype.kind == "i" else ~shadow.astype(bool)
+    diffuse = np.clip(normal @ key, 0, None) * seen
+    soft = 0.5 + 0.5 * np.clip(normal @ fill, -1, 1)
+    sky = 0.5 + 0.5 * normal[:, 1]
+    return base * (0.72 * diffuse + 0.22 * soft + 0.26 * sky)[:, None]
+
+
+def _rays(camera: Camera, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    forward = camera.target - camera.eye
+    distance = np.linalg.norm(forward)
+    forward = forward / distance
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    scale = camera.height / height
+    x = (np.arange(width) + 0.5 - width / 2) * scale
+    y = (height / 2 - np.arange(height) - 0.5) * scale
+    plane = distance * forward + y[:, None, None] * up + x[None, :, None] * right
+    directions = plane.reshape(-1, 3)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.tile(camera.eye.astype(np.float32), (len(directions), 1)), directions.astype(np.float32)
+
+
+def _embree():
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError as error:
+        raise ImportError("pictures need embreex: pip install clothjax[render]") from error
+    return EmbreeScene, TriangleMesh
+
+
+def _pillow(*names: str):
+    try:
+        import importlib
+
+        return [importlib.import_module(f"PIL.{name}") for name in names]
+    except ImportError as error:
+        raise ImportError("pictures need Pillow: pip install clothjax[render]") from error
