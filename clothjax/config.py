@@ -131,7 +131,7 @@ class ModelConfig:
     """Of that Newton step, at the start of training; a learned matrix corrects it."""
     descent_damping: float = 0.1
     """J, added to the Hessian of unit codes: folds are stiffer than the rest shape."""
-    descent_bound: float = 1.0
+    descent_bound: float = 0.3
     """Length of the step in Z that it cannot exceed."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""

@@ -1,0 +1,99 @@
+"""From nothing to a garment moving on a body: trains, measures, draws and exports the t-shirt of configs/quickstart.yaml.
+
+    python -m experiments.quickstart                      # what `make quickstart` runs
+    python -m experiments.quickstart --stage1.steps 400   # any setting may be changed
+
+It leaves in `runs/quickstart/`: the checkpoints of both stages, report.json, report.md, comparison.png, walk.webp,
+tshirt.onnx (with tshirt.json, how to drive it) and tshirt.glb. Run again, it goes on where it stopped.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from clothjax import configuration, experiment, inference
+from clothjax.config import Config
+from clothjax.export.onnx import check_onnx, to_onnx
+from clothjax.types import Motion, Pose
+from experiments import render
+from experiments.evaluate import evaluate, table
+from experiments.session import fail_clearly, setup
+from experiments.train import load_phi, run_directory, train
+
+CONFIG = str(Path("configs") / "quickstart.yaml")
+ONNX_FRAMES = 100
+
+
+def main(argv: list[str]) -> None:
+    started = time.monotonic()
+    config = configuration.cli(Config, [CONFIG, *argv])
+    directory = run_directory(config, [CONFIG])
+    clock = train(config, directory)
+    trained = time.monotonic() - started
+
+    print("measuring against the reference solver")
+    report = evaluate(directory)
+    whole, _ = load_phi(directory)
+    motion = config.evaluation.motions[0]
+    betas = experiment.betas(config)
+
+    print("exporting and drawing")
+    model = inference.load(directory, betas=betas)
+    clip = experiment.motion(whole, motion)
+    origin = clip.translation[0]
+    part = Motion(clip.rotations[:ONNX_FRAMES], (clip.translation[:ONNX_FRAMES] - origin).astype(np.float32), clip.fps)
+    onnx = to_onnx(model, directory / "tshirt.onnx", Pose(part.rotations[0], part.translation[0]))
+    onnx_error = check_onnx(onnx, model, part)
+    glb_error = render.write_glb(directory, whole, motion, directory / "tshirt.glb", 120)
+    render.write_comparison(directory, whole, motion, directory / "comparison.png")
+    render.write_webp(directory, whole, motion, directory / "walk.webp", 120)
+
+    report = {
+        "quickstart": {
+            "train_seconds": clock["stage1_seconds"] + clock["stage2_seconds"] + clock["teacher_seconds"] + clock["compile_seconds"],
+            **clock,
+            "this_session_training_seconds": trained,
+            "this_session_seconds": time.monotonic() - started,
+            "onnx_error_mm": 1e3 * onnx_error,
+            "onnx_frames": len(part.rotations),
+            "glb_error_mm": {name: 1e3 * error for name, error in glb_error.items()},
+            "device": str(jax.devices()[0]),
+        },
+        **report,
+    }  # fmt: skip
+    (directory / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+    (directory / "report.md").write_text(readable(report, config))
+    print(table(report))
+    print(f"ONNX Runtime differs from jax by {1e3 * onnx_error:.4f} mm at most over {len(part.rotations)} frames")
+    print(f"look at {directory / 'comparison.png'} and {directory / 'walk.webp'}; figures in {directory / 'report.md'}")
+
+
+def readable(report: dict, config: Config) -> str:
+    """The report for a reader."""
+    figures = report["quickstart"]
+    return f"""# Quickstart report
+
+Garment {config.garment}, motion {", ".join(config.evaluation.motions)} (not trained on), betas of seed
+{config.evaluation.betas_seed} within {config.evaluation.betas} standard deviations. Training took
+{figures["train_seconds"]:.0f} s: stage 1 {figures["stage1_seconds"]:.0f} s, the teacher's rollouts
+{figures["teacher_seconds"]:.0f} s, stage 2 {figures["stage2_seconds"]:.0f} s, compilation
+{figures["compile_seconds"]:.0f} s.
+
+What the rows mean is in the docstring of `experiments/evaluate.py`. Gaps are over {config.evaluation.gap_frames}
+frames of each motion; 0 is the reference solver, 1 plain skinning (`energy_gap`) or a garment that keeps its last
+canonical displacement (`hold_gap`).
+
+{table(report)}
+
+ONNX Runtime against jax over {figures["onnx_frames"]} frames: {figures["onnx_error_mm"]:.4f} mm at most.
+"""
+
+
+if __name__ == "__main__":
+    setup()
+    with fail_clearly():
+        main(sys.argv[1:])
