@@ -225,6 +225,8 @@ class EvaluationConfig:
     betas: float = 1.5  # standard deviations
     gap_frames: int = 10
     """Frames at which the reference solver is asked."""
+    solver_frames: int = 60
+    """Frames of the reference solver's own closed loop, for jitter and pictures."""
     long_frames: int = 1000
     """Frames of the closed-loop test, the motion repeated."""
 

@@ -234,7 +234,7 @@ def make_update(
         (loss, (each, (cloth, terms, seen))), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
             state.params, state.statistics, simulations, state.step, clips
         )
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm) & jnp.isfinite(loss)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
         with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers

@@ -165,7 +165,7 @@ def make_update(
     def one(teacher: Teacher, state: TrainingState, _):
         key = jax.random.fold_in(state.key, state.step)
         value, gradient = jax.value_and_grad(loss)(state.params, state.normalizers, teacher, key)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm) & jnp.isfinite(value)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
         with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers

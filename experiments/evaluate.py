@@ -16,7 +16,7 @@ solver: every number is about the stage's own trajectory, with the configured ma
     edge_strain_p95, edge_strain_max          of |l / l_0 - 1|.
     jitter          rms of the second time difference of vertex accelerations, over the solver's own in closed loop.
     psi_phi_mm      mean vertex distance of Psi to Phi, over the first motion played there and back for
-                    `evaluation.long_frames` frames of closed loop, from frame 10 on; `_last100` its last hundred.
+                    `evaluation.long_frames` frames of closed loop, from frame 5 on; `_last100` its last hundred.
     finite          no value of that long run was not finite.
     ms_per_frame    of the jitted closed loop, on this machine.
 
@@ -42,8 +42,7 @@ from clothjax.types import Motion, Pose
 from experiments.session import fail_clearly, progress, setup
 from experiments.train import load_phi
 
-SOLVER_FRAMES = 60  # of the reference solver's own closed loop, for jitter and pictures
-SETTLING = 10  # frames left out of averages over time: the start is a skinned garment
+SETTLING = 5  # frames left out of averages over time: the start is a skinned garment
 
 
 def main(argv: list[str]) -> None:
@@ -98,7 +97,7 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
     tracks["psi"] = psi_trajectory(psi, clip)
     done(1)
     solved, converged = metrics.simulate(
-        whole.scene, character, jax.tree.map(lambda x: x[: min(SOLVER_FRAMES, frames)], poses), config
+        whole.scene, character, jax.tree.map(lambda x: x[: min(config.evaluation.solver_frames, frames)], poses), config
     )
     done(2)
     advance = np.asarray(poses.translation[:, 2])

@@ -30,7 +30,7 @@ def shrink(config: Config) -> Config:
         stage2=dataclasses.replace(
             config.stage2, steps=40, batch=4, rollout=2, hidden=(16,), sequences=2, frames=6
         ),
-        evaluation=dataclasses.replace(config.evaluation, gap_frames=2, long_frames=40),
+        evaluation=dataclasses.replace(config.evaluation, gap_frames=1, solver_frames=12, long_frames=40),
     )
 
 
