@@ -157,7 +157,7 @@ def _lists(tree: Any) -> Any:
     """Dictionaries with the keys 0, 1, 2, ... as lists."""
     if not isinstance(tree, dict):
         return tree
-    if all(key.isdecimal() for key in tree):
+    if tree.keys() == {str(i) for i in range(len(tree))}:  # not where an element without leaves left a gap
         return [_lists(tree[str(i)]) for i in range(len(tree))]
     return {key: _lists(value) for key, value in tree.items()}
 
