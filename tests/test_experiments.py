@@ -1,0 +1,122 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clothjax import clips, experiment, features, scene
+from clothjax.config import Config
+from clothjax.types import Motion
+from experiments import evaluate, quickstart, render, train
+
+TOY = [
+    "--stage1.steps", "60", "--stage1.pool", "4", "--stage2.steps", "40", "--stage2.sequences", "4",
+    "--stage2.frames", "12", "--stage2.batch", "4", "--stage2.rollout", "2", "--model.width", "8",
+    "--model.latent", "64", "--model.blendshapes", "12", "--evaluation.gap-frames", "1",
+    "--evaluation.solver-frames", "12", "--evaluation.long-frames", "40",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The whole quickstart in a minute."""
+    directory = tmp_path_factory.mktemp("runs") / "toy"
+    quickstart.main([*TOY, "--directory", str(directory)])
+    return directory
+
+
+def test_the_quickstart_leaves_everything_it_promises(finished):
+    report = json.loads((finished / "report.json").read_text())
+    for stage in ("lbs", "phi", "psi"):
+        assert {"energy_gap", "hold_gap", "step_error_mm", "penetration_percent", "edge_strain_p95", "jitter"} <= set(
+            report["evaluation"][stage]
+        )
+    assert report["evaluation"]["lbs"]["energy_gap"] == pytest.approx(1.0)
+    assert report["evaluation"]["psi"]["finite"] is True
+    assert report["quickstart"]["train_seconds"] > 0
+    assert report["quickstart"]["onnx_error_mm"] < 0.1
+    assert "hold_gap" in (finished / "report.md").read_text()
+    assert Image.open(finished / "comparison.png").size[0] > 1000
+    assert Image.open(finished / "walk.webp").n_frames > 100
+    assert (finished / "tshirt.glb").stat().st_size > 10_000
+    assert json.loads((finished / "tshirt.json").read_text())["inputs"]["rotations"] == [31, 3, 3]
+
+
+def test_a_finished_run_is_not_trained_again(finished):
+    before = sorted(path.name for path in (finished / "stage1" / "checkpoints").iterdir())
+    config = train.load_phi(finished)[0].config
+    train.train(config, finished)
+    assert sorted(path.name for path in (finished / "stage1" / "checkpoints").iterdir()) == before
+
+
+def test_evaluate_and_render_from_the_command_line(finished, capsys):
+    evaluate.main([str(finished), "--motion", "twist_3", "--json", str(finished / "twist.json")])
+    assert "twist_3" in json.loads((finished / "twist.json").read_text())["motions"]
+    assert "| hold_gap |" in capsys.readouterr().out
+    render.main([str(finished), "--motion", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
+    assert Image.open(finished / "t.webp").n_frames == 3
+    with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
+        render.main([str(finished), "--out", "x.gif"])
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="train first"):
+        evaluate.main([str(tmp_path)])
+
+
+def test_a_clip_there_and_back_has_no_jump():
+    rotations = np.tile(np.eye(3), (5, 2, 1, 1))
+    clip = Motion(rotations, np.arange(15.0).reshape(5, 3), 30.0)
+    long = experiment.there_and_back(clip, 13)
+    assert long.translation[:, 0].tolist() == [0, 3, 6, 9, 12, 9, 6, 3, 0, 3, 6, 9, 12]
+
+
+def test_every_family_is_started_from_equally_often_and_never_near_a_bad_frame():
+    import jax
+
+    def clip(frames):
+        return Motion(np.tile(np.eye(3), (frames, 1, 1, 1)), np.zeros((frames, 3)), 30.0)
+
+    reel = clips.concatenate([clip(100), clip(20)], ["walk", "jump"], [np.array([50]), np.zeros(0, int)], 3)
+    drawn = np.asarray(jax.vmap(lambda u: clips.draw(reel, u))(np.linspace(0, 0.9999, 4000, dtype=np.float32)))
+    assert abs((drawn < 100).mean() - 0.5) < 0.01
+    assert (reel.remaining[drawn] >= 3).all()
+    assert not np.isin(drawn, [46, 47, 48, 49, 50, 51]).any()
+    with pytest.raises(ValueError, match="no motion has 102 usable frames"):
+        clips.concatenate([clip(100)], ["walk"], [np.zeros(0, int)], 100)
+
+
+def test_frame_rates_must_agree(tmp_path):
+    config = Config(fps=60.0)
+    whole = experiment.assemble(config)
+    with pytest.raises(ValueError, match=r"walk_0 has 30\.0 frames a second, the experiment 60\.0"):
+        experiment.motion(whole, "walk_0")
+
+
+def test_the_body_in_reach_reaches_beyond_the_garment_without_head_or_hands():
+    whole = experiment.assemble(Config())
+    dominant = {whole.names[j] for j in np.asarray(whole.scene.body.weights).argmax(1)}
+    assert {"Hips", "Spine", "LeftArm", "RightForeArm", "LeftUpLeg"} <= dominant
+    assert not {"Head", "LeftHand", "RightHandFinger1", "LeftFoot"} & dominant
+    low = np.asarray(whole.scene.garment.vertices)[:, 1].min()
+    assert np.asarray(whole.scene.body.vertices)[:, 1].min() < low - 0.2
+
+
+def test_a_garment_elsewhere_is_refused():
+    whole = experiment.assemble(Config())
+    far = whole.garment._replace(vertices=whole.garment.vertices + 5)
+    with pytest.raises(ValueError, match="no part of the body is within"):
+        scene.reachable(whole.body, far, 0.35)
+
+
+def test_statistics_are_those_of_all_rows_seen():
+    random = np.random.default_rng(0)
+    batches = [random.normal(3.0, 2.0, (50, 4)).astype(np.float32) + i for i in range(5)]
+    statistics = features.empty_statistics(4)
+    for batch in batches:
+        statistics = features.observe(statistics, batch, 10)
+    rows = np.concatenate(batches)
+    np.testing.assert_allclose(statistics.mean, rows.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(statistics.variance, rows.var(0), rtol=1e-4)
+    frozen = features.observe(statistics, 100 * batches[0], 5)
+    np.testing.assert_array_equal(frozen.mean, statistics.mean)
