@@ -141,7 +141,13 @@ def webp(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: in
     (image,) = _pillow("Image")
     pictures = [image.fromarray(frame) for frame in frames]
     pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0, quality=quality, method=4
+        path,
+        save_all=True,
+        append_images=pictures[1:],
+        duration=round(1000 / fps),
+        loop=0,
+        quality=quality,
+        method=4,
     )
 
 

@@ -62,7 +62,10 @@ def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig)
     """The character at a pose whose translation [3] m is relative to the root's at the current frame."""
     transforms = skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents)
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
-    body = skinning.apply(skinning.blend(scene.body.weights, transforms), skinning.pose_corrected(scene.body, character.body, pose))
+    body = skinning.apply(
+        skinning.blend(scene.body.weights, transforms),
+        skinning.pose_corrected(scene.body, character.body, pose),
+    )
     normals = skinning.vertex_normals(body, scene.body.faces)
     vertices_collide = config.contact_surface == "vertices"
     root = int(np.flatnonzero(np.asarray(scene.body.parents) < 0)[0])
@@ -78,9 +81,7 @@ def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig)
 
 def window(scene: Scene, character: Character, poses: Pose, config: PhysicsConfig) -> Window:
     """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
-    return Window(
-        *(frame(scene, character, Pose(poses.rotations[i], poses.translation[i]), config) for i in range(3))
-    )
+    return Window(*(frame(scene, character, Pose(poses.rotations[i], poses.translation[i]), config) for i in range(3)))
 
 
 def skinned(character: Character, frame: Frame) -> Array:

@@ -38,9 +38,7 @@ class _Damaged(Exception):
     """The files of a checkpoint are not what was written."""
 
 
-def save(
-    directory: str | Path, step: int, state: Any, config: dict, description: str = "", *, keep: int = 3
-) -> None:
+def save(directory: str | Path, step: int, state: Any, config: dict, description: str = "", *, keep: int = 3) -> None:
     """Writes a checkpoint, then removes all but the newest `keep`. Each process of a run calls it.
 
     Args:
@@ -56,9 +54,7 @@ def save(
     directory = Path(directory).resolve()
     existing = steps(directory)
     if existing and existing[-1] >= step:
-        raise ValueError(
-            f"{directory}: cannot save step {step}, there is already a checkpoint of step {existing[-1]}"
-        )
+        raise ValueError(f"{directory}: cannot save step {step}, there is already a checkpoint of step {existing[-1]}")
     named = {name: jnp.asarray(leaf) for name, leaf in _named(state).items()}
     about = {
         "format": FORMAT,
@@ -67,16 +63,12 @@ def save(
         "description": description,
         "leaves": {name: _describe(leaf) for name, leaf in named.items()},
     }
-    arrays = {
-        name: _plain(leaf) for name, leaf in named.items() if leaf.size
-    }  # Orbax cannot store empty arrays
+    arrays = {name: _plain(leaf) for name, leaf in named.items() if leaf.size}  # Orbax cannot store empty arrays
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
     )
     with ocp.CheckpointManager(directory, options=options) as manager:
-        manager.save(
-            step, args=ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about))
-        )
+        manager.save(step, args=ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about)))
 
 
 def steps(directory: str | Path) -> list[int]:
@@ -84,9 +76,7 @@ def steps(directory: str | Path) -> list[int]:
     directory = Path(directory)
     if not directory.is_dir():
         return []
-    return sorted(
-        int(entry.name) for entry in directory.iterdir() if entry.name.isdecimal() and entry.is_dir()
-    )
+    return sorted(int(entry.name) for entry in directory.iterdir() if entry.name.isdecimal() and entry.is_dir())
 
 
 def latest(directory: str | Path) -> Checkpoint:
@@ -226,9 +216,7 @@ def _about(path: Path) -> Checkpoint:
     except Exception as error:  # whatever Orbax makes of broken files: the reason is kept in the message
         raise _Damaged(f"its description cannot be read: {_first_line(error)}") from error
     if version > FORMAT:
-        raise ValueError(
-            f"{path}: has format {version}, this version of clothjax reads up to {FORMAT}; update it"
-        )
+        raise ValueError(f"{path}: has format {version}, this version of clothjax reads up to {FORMAT}; update it")
     return checkpoint
 
 
@@ -258,9 +246,7 @@ def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
             )
     left_over = sorted(set(checkpoint.leaves) - set(wanted)) if whole else []
     if left_over:
-        raise ValueError(
-            f"{checkpoint.path}: holds {', '.join(left_over[:5])}, which this model has not: {hint}"
-        )
+        raise ValueError(f"{checkpoint.path}: holds {', '.join(left_over[:5])}, which this model has not: {hint}")
 
 
 def _leaves(checkpoint: Checkpoint, wanted: dict[str, Any]) -> dict[str, jax.Array]:

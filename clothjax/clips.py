@@ -18,9 +18,7 @@ class Clips(NamedTuple):
     chance: Array  # [N] cumulative probability of starting at a frame
 
 
-def concatenate(
-    motions: Sequence[Motion], families: Sequence[str], bad: Sequence[np.ndarray], shortest: int
-) -> Clips:
+def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequence[np.ndarray], shortest: int) -> Clips:
     """Clips for training.
 
     Args:

@@ -39,7 +39,12 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
         subkey = jax.random.fold_in(keys[3], index)
         convolution.append(
             mesh_convolution.init(
-                subkey, table, channels, level.features or per_vertex, config.convolution_bases, config.residual_rate
+                subkey,
+                table,
+                channels,
+                level.features or per_vertex,
+                config.convolution_bases,
+                config.residual_rate,
             )
         )
         channels = level.features
@@ -63,7 +68,11 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
 
 def init_statistics(example: Features) -> dict[str, Statistics]:
     """Empty statistics for features like `example`."""
-    columns = {"nodes": example.nodes, "mesh": next(iter(example.edges.values())), "world": example.to_garment}
+    columns = {
+        "nodes": example.nodes,
+        "mesh": next(iter(example.edges.values())),
+        "world": example.to_garment,
+    }
     return {name: feature.empty_statistics(rows.shape[-1]) for name, rows in columns.items()}
 
 
@@ -120,7 +129,12 @@ def encode(
     )
     for block, table in zip(params["convolution"], scene.tables):
         processed = mesh_convolution.apply(
-            block, processed, table.ids, table.mask, residual_rate=config.residual_rate, activation=jax.nn.relu
+            block,
+            processed,
+            table.ids,
+            table.mask,
+            residual_rate=config.residual_rate,
+            activation=jax.nn.relu,
         )
     if "latent" in params:
         processed = dense(params["latent"], processed)
@@ -137,7 +151,7 @@ def descend(params: Params, latent: Array, code: Array, force: Array, stiffness:
     descent = params["descent"]
     push = config.descent_rate / stiffness * (force @ jax.lax.stop_gradient(descent["inverse_hessian"]))
     push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / config.descent_bound**2)
-    return latent + push + push @ descent["correction"] + code
+    return (1.0 - config.latent_decay) * latent + push + push @ descent["correction"] + code
 
 
 def inverse_hessian(potential: Callable[[Array], Array], garment: Params, size: int, config: ModelConfig) -> Array:

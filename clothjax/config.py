@@ -133,6 +133,8 @@ class ModelConfig:
     """J, added to the Hessian of unit codes: folds are stiffer than the rest shape."""
     descent_bound: float = 0.3
     """Length of the step in Z that it cannot exceed."""
+    latent_decay: float = 0.1
+    """Part of Z forgotten in a frame, when the network gives its change: without it, what moves no vertex drifts."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
     decoder_skip: bool = True

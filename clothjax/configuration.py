@@ -209,9 +209,7 @@ def _coerce_tuple(arguments: tuple, value: Any, path: str, sources: Sources, def
         arguments = (arguments[0],) * len(value)
     if len(arguments) != len(value):
         _fail(f"expected {len(arguments)} values, got {len(value)}: {value!r}", path, sources, default)
-    return tuple(
-        _coerce(a, v, f"{path}[{i}]", sources, default) for i, (a, v) in enumerate(zip(arguments, value))
-    )
+    return tuple(_coerce(a, v, f"{path}[{i}]", sources, default) for i, (a, v) in enumerate(zip(arguments, value)))
 
 
 def _scalar(kind: type, value: Any) -> bool | int | float | str | None:

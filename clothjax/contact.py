@@ -7,6 +7,7 @@ from clothjax.types import Array, Contact
 
 BLOCK = 64
 
+
 def surface(vertices: Array, faces: Array, kind: str) -> tuple[Array, Array]:
     """Points [P, 3] m and unit normals [P, 3] of a body [B, 3] m: its `vertices`, or its face centroids (`faces`)."""
     if kind == "vertices":

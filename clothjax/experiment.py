@@ -27,9 +27,7 @@ def assemble(config: Config) -> Experiment:
     """Loads the garment and the body of a configuration and builds their scene."""
     body = storage.load_body(config.body)
     garment = storage.load_garment(config.garment, body)
-    return Experiment(
-        config, storage.joint_names(config.body), body, garment, scene.build(garment, body, config)
-    )
+    return Experiment(config, storage.joint_names(config.body), body, garment, scene.build(garment, body, config))
 
 
 def motion(experiment: Experiment, name: str) -> Motion:

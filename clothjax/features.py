@@ -71,9 +71,7 @@ def features(
     def node(velocity, acceleration, normal, position, log_mass, materials):
         shared = [velocity, acceleration, normal, position - current.root[None]]
         columns = [_rotate(turn, part) for part in shared]
-        return jnp.concatenate(
-            [*columns, _column(jnp.asarray(timestep), count), log_mass[:, None], materials], axis=-1
-        )
+        return jnp.concatenate([*columns, _column(jnp.asarray(timestep), count), log_mass[:, None], materials], axis=-1)
 
     garment = node(
         state.velocity,
@@ -183,7 +181,10 @@ def _mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
         if name in points:
             vector = points[name][senders] - points[name][receivers]
             columns += [_length(vector) / rest_length - 1.0]
-    columns += [_column(jnp.asarray(timestep), len(senders)), jnp.broadcast_to(inputs[None], (len(senders), 3))]
+    columns += [
+        _column(jnp.asarray(timestep), len(senders)),
+        jnp.broadcast_to(inputs[None], (len(senders), 3)),
+    ]
     return jnp.concatenate(columns, axis=-1)
 
 

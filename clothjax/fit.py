@@ -94,9 +94,7 @@ def fit(
         state = _resume(checkpoints, state, config, may_differ)
         first = _step(state)
         seconds, compile_seconds = run_folder.read_seconds(directory) if first else (0.0, 0.0)
-        rows = (
-            run_folder.metrics_file(directory, first) if leader else contextlib.nullcontext(lambda row: None)
-        )
+        rows = run_folder.metrics_file(directory, first) if leader else contextlib.nullcontext(lambda row: None)
         saved = time.monotonic()
         with rows as write, _progress(first, steps, report_seconds) as report:
             for call in _calls(update, state, first, steps, steps_per_call, max_nonfinite):
@@ -140,9 +138,7 @@ def _calls(
         if "loss" not in metrics or set(shapes.values()) != {(steps_per_call,)}:
             raise ValueError(f"`update` must return metrics [{steps_per_call}] with a `loss`, got {shapes}")
         if _step(state) != step + steps_per_call:
-            raise ValueError(
-                f"`update` went from step {step} to {_step(state)}, not {steps_per_call} steps on"
-            )
+            raise ValueError(f"`update` went from step {step} to {_step(state)}, not {steps_per_call} steps on")
         skipped = _check_finite(metrics, step, skipped, max_nonfinite)
         step += steps_per_call
         compile_seconds = returned - began if compile_seconds is None else 0.0
@@ -210,17 +206,13 @@ def _resume(checkpoints: Path, state: Any, config: dict, may_differ: tuple[str, 
 def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
     if not isinstance(config, dict):
         return {prefix: config}
-    return {
-        k: v for key in config for k, v in _flat(config[key], f"{prefix}.{key}" if prefix else key).items()
-    }
+    return {k: v for key in config for k, v in _flat(config[key], f"{prefix}.{key}" if prefix else key).items()}
 
 
 def _save(checkpoints: Path, call: _Call, config: dict, description: str, keep: int) -> None:
     """A checkpoint, unless there is a NaN in the state."""
     leaves = jax.tree_util.tree_flatten_with_path(call.state)[0]
-    named = {
-        jax.tree_util.keystr(path): leaf for path, leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)
-    }
+    named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)}
     bad = [name for name, found in jax.device_get(_any_nan(named)).items() if found]
     if bad:
         raise FloatingPointError(f"the state of step {call.step} has NaN in {', '.join(bad[:5])}")
@@ -239,11 +231,7 @@ def _advice(checkpoints: Path) -> Iterator[None]:
         yield
     except FloatingPointError as error:
         steps = checkpoint.steps(checkpoints)
-        left = (
-            f"the last good checkpoint is {checkpoints / str(steps[-1])}"
-            if steps
-            else "there is no checkpoint"
-        )
+        left = f"the last good checkpoint is {checkpoints / str(steps[-1])}" if steps else "there is no checkpoint"
         raise FloatingPointError(
             f"training diverged: {error}; {left}. Train in another directory with a lower learning rate"
         ) from error

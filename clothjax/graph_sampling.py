@@ -167,9 +167,7 @@ def _coarsen(neighbours: Neighbours, hops: np.ndarray) -> np.ndarray:
 
 def _hops(vertex_count: int, edges: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """Hop distance [V] from the nearest source; 0 where there is none: HOOD counts loose vertices as even."""
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count)
-    ).tocsr()
+    graph = scipy.sparse.coo_array((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count)).tocsr()
     hops = dijkstra(graph, directed=False, indices=sources, unweighted=True, min_only=True)
     return np.where(np.isfinite(hops), hops, 0).astype(np.int32)
 

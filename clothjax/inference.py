@@ -139,9 +139,7 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
     vertices = garment_model.vertices(
         displaced, model.garment.vertices, skinning.blend(model.garment.weights, transforms)
     )
-    following = State(
-        latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]])
-    )
+    following = State(latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]]))
     return following, vertices + pose.translation[None]
 
 

@@ -58,9 +58,7 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
             config.friction_smoothing,
         ),
         "collision": config.collision_stiffness
-        * physics.collision(
-            contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset
-        ),
+        * physics.collision(contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset),
     }
 
 
@@ -77,9 +75,7 @@ def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> 
 def weighted(terms: dict[str, Array], config: LossConfig, training_step: Array) -> Array:
     """The training loss: the weighted sum of terms in J over `config.scale`; absent terms are not computed."""
     total = sum(
-        weight(getattr(config, name), training_step) * terms[name]
-        for name in TERMS
-        if not getattr(config, name).absent
+        weight(getattr(config, name), training_step) * terms[name] for name in TERMS if not getattr(config, name).absent
     )
     return total / config.scale
 

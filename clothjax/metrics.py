@@ -67,8 +67,7 @@ def step_measures(
         taken, kept = energy(new, step), energy(held, step)
         # two starts, the better end: folds have many minima
         ends = [
-            solver.solve_step(begin, step, scene.mesh, scene.garment.pinned, config.physics)
-            for begin in (new, held)
+            solver.solve_step(begin, step, scene.mesh, scene.garment.pinned, config.physics) for begin in (new, held)
         ]
         best, info = min(ends, key=lambda end: (not end[1].converged, end[1].energy))
         error = np.linalg.norm(best - np.asarray(new, np.float64), axis=-1)
@@ -167,9 +166,7 @@ def penetrations(
     def posed(rotations):
         return skinning.pose_body(body, vertices, joints, Pose(rotations, jnp.zeros(3)))
 
-    values = np.array(
-        [penetration(trajectory[t], posed(poses.rotations[t, 1]), body.faces) for t in frames]
-    )
+    values = np.array([penetration(trajectory[t], posed(poses.rotations[t, 1]), body.faces) for t in frames])
     return {
         "penetration_percent": float(values[:, 0].mean()),
         "penetration_percent_median": float(np.median(values[:, 0])),

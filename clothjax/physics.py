@@ -39,9 +39,7 @@ def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:
         face_area=face_area,
         hinge_area=_triangle_areas(vertices[mesh.hinges]),
         hinge_angle=jnp.zeros_like(angle) if flat else angle,
-        vertex_area=jnp.zeros_like(vertices[:, 0])
-        .at[mesh.faces.reshape(-1)]
-        .add(jnp.repeat(face_area / 3.0, 3)),
+        vertex_area=jnp.zeros_like(vertices[:, 0]).at[mesh.faces.reshape(-1)].add(jnp.repeat(face_area / 3.0, 3)),
     )
 
 
@@ -53,9 +51,7 @@ def green_strain(corners: Array, inverse: Array) -> Array:
     return 0.5 * (metric - jnp.eye(2, dtype=corners.dtype)[None])
 
 
-def stretching(
-    corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=THICKNESS
-) -> Array:
+def stretching(corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=THICKNESS) -> Array:
     """Saint Venant-Kirchhoff energy [F] J: A h (mu tr(G^2) + lambda/2 tr(G)^2) of triangles [F, 3, 3] m."""
     strain = green_strain(corners, inverse)
     trace = strain[:, 0, 0] + strain[:, 1, 1]
@@ -99,9 +95,7 @@ def collision(distance: Array, offset=COLLISION_OFFSET) -> Array:
     return depth * depth * depth
 
 
-def friction(
-    slip: Array, normal: Array, mass: Array, touching: Array, coefficient=0.5, smoothing=1e-4
-) -> Array:
+def friction(slip: Array, normal: Array, mass: Array, touching: Array, coefficient=0.5, smoothing=1e-4) -> Array:
     """HOOD's friction potential [V] J: c g m kappa |tau| where a vertex touches the body.
 
     tau is the slip [V, 3] m relative to the body without its part along the contact normal [V, 3], and

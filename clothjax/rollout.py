@@ -55,7 +55,13 @@ def time_step(
 
 
 def take(
-    model: dict, scene: Scene, character: Character, state: ClothState, window: Window, timestep: Array, config: Config
+    model: dict,
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    window: Window,
+    timestep: Array,
+    config: Config,
 ) -> tuple[ClothState, Taken]:
     """One frame of Phi; `model` holds `params` and `statistics`. The state returned is still at the current root."""
     step, planes = time_step(character, state, window, timestep, config)
@@ -79,9 +85,7 @@ def follow(state: ClothState, advance: Array) -> ClothState:
     return state._replace(position=state.position - advance[None])
 
 
-def settle(
-    model: dict, scene: Scene, character: Character, poses: Pose, config: Config
-) -> ClothState:
+def settle(model: dict, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
     """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
     window = characters.window(scene, character, poses, config.physics)
     size = _latent_size(scene, config)

@@ -116,9 +116,7 @@ def solve_step(
 
 
 @partial(jax.jit, static_argnames="config")
-def hessians(
-    x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig
-) -> tuple[Array, Array]:
+def hessians(x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig) -> tuple[Array, Array]:
     """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
 
     The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the
@@ -134,9 +132,9 @@ def hessians(
         return physics.bending(points[None], area[None], angle[None], material.bending)[0]
 
     def vertex_gradient(new):
-        return jax.grad(
-            lambda y: sum(jnp.sum(losses.elements(y, step, mesh, config)[name]) for name in VERTEX_TERMS)
-        )(new)
+        return jax.grad(lambda y: sum(jnp.sum(losses.elements(y, step, mesh, config)[name]) for name in VERTEX_TERMS))(
+            new
+        )
 
     # every vertex term depends on one vertex only, so three directions give all 3 x 3 blocks
     axes = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, :], (3, *x.shape))

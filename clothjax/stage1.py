@@ -62,7 +62,10 @@ def optimizer(config: Config) -> optax.GradientTransformation:
     stage = config.stage1
     hold = max(1, int(stage.decay_start * stage.steps))
     decay = optax.exponential_decay(
-        stage.learning_rate, max(1, stage.steps - hold), stage.decay_end, end_value=stage.learning_rate * stage.decay_end
+        stage.learning_rate,
+        max(1, stage.steps - hold),
+        stage.decay_end,
+        end_value=stage.learning_rate * stage.decay_end,
     )
     warm = min(200, hold)
     schedule = optax.join_schedules(
@@ -73,7 +76,8 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 
     def slower(updates):
         return jax.tree_util.tree_map_with_path(
-            lambda path, u: stage.blendshape_rate * u if "blendshapes" in jax.tree_util.keystr(path) else u, updates
+            lambda path, u: stage.blendshape_rate * u if "blendshapes" in jax.tree_util.keystr(path) else u,
+            updates,
         )
 
     return optax.chain(
@@ -104,9 +108,7 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     stiffness = physical_stiffness(config)
-    basis = laplacian_basis(
-        scene, config.model.blendshapes, stiffness, config.material.density, 1.0 / config.fps
-    )
+    basis = laplacian_basis(scene, config.model.blendshapes, stiffness, config.material.density, 1.0 / config.fps)
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
     example = example_features(scene, clips, config)
     params = compact_latent.init(model_key, scene, example, 0.1 * basis, config.model)
@@ -114,9 +116,7 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
         params["descent"]["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(
             params["garment"]
         )
-    pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(
-        jax.random.split(pool_key, config.stage1.pool)
-    )
+    pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(jax.random.split(pool_key, config.stage1.pool))
     return TrainingState(
         step=jnp.int32(0),
         key=key,
@@ -245,17 +245,13 @@ def make_update(
         advance = jnp.where(simulations.fresh, frames - 1, frames)
         frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advance)
         cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
-        following = Simulation(
-            cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh)
-        )
+        following = Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
 
         def only_if_good(new, old):
             return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
 
         statistics = compact_latent.observe(state.statistics, seen, config.model.normalizer_steps)
-        average = jax.tree.map(
-            lambda a, p: stage.ema * a + (1 - stage.ema) * p, state.average, params
-        )
+        average = jax.tree.map(lambda a, p: stage.ema * a + (1 - stage.ema) * p, state.average, params)
         new = TrainingState(
             step=state.step + 1,
             key=state.key,

@@ -12,7 +12,7 @@ import optax
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, latent_predictor, rollout, stage1
+from clothjax import latent_predictor, rollout, stage1
 from clothjax.clips import Clips
 from clothjax.config import Config
 from clothjax.latent_predictor import Normalizers
@@ -41,7 +41,12 @@ class TrainingState(NamedTuple):
 
 
 def teach(
-    model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config, progress: Callable = lambda done: None
+    model: dict,
+    scene: Scene,
+    clips: Clips,
+    kept: np.ndarray,
+    config: Config,
+    progress: Callable = lambda done: None,
 ) -> tuple[Teacher, float]:
     """Rolls Phi out on random clips, bodies and materials; also tells the seconds it took.
 
@@ -60,7 +65,7 @@ def teach(
         character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
         frames = simulation.frame + jnp.arange(stage.frames)
         poses = jax.vmap(lambda t: motion.poses(clips, t))(frames)
-        _, states, latents = rollout.play(model, scene, character, poses, config)
+        _, _states, latents = rollout.play(model, scene, character, poses, config)
 
         def inputs(pose: Pose):
             return latent_predictor.pose_inputs(
@@ -90,9 +95,7 @@ def init(teacher: Teacher, garment: dict, config: Config) -> TrainingState:
     """The state before the first step, its normalizers measured on the teacher's rollouts."""
     key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
     size = teacher.latents.shape[-1]
-    params = latent_predictor.init(
-        model_key, size, teacher.poses.shape[-1], teacher.constants.shape[-1], config.stage2
-    )
+    params = latent_predictor.init(model_key, size, teacher.poses.shape[-1], teacher.constants.shape[-1], config.stage2)
     return TrainingState(
         step=jnp.int32(0),
         key=key,
@@ -117,7 +120,13 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def rollout_loss(
-    params: dict, normalizers: Normalizers, latents: Array, poses: Array, constants: Array, key: Array, config: Config
+    params: dict,
+    normalizers: Normalizers,
+    latents: Array,
+    poses: Array,
+    constants: Array,
+    key: Array,
+    config: Config,
 ) -> Array:
     """Mean squared error of one closed-loop rollout, in variances of the code.
 
@@ -127,7 +136,9 @@ def rollout_loss(
         latents: [H + 1, L] teacher codes; poses: [H, P]; constants: [C]; key: of the noise.
     """
     targets = jax.vmap(lambda z: latent_predictor.normalise(normalizers.latent, z))(latents)
-    poses = jax.vmap(lambda x: latent_predictor.normalise(normalizers.pose, x, bound=latent_predictor.POSE_BOUND))(poses)
+    poses = jax.vmap(lambda x: latent_predictor.normalise(normalizers.pose, x, bound=latent_predictor.POSE_BOUND))(
+        poses
+    )
     noise = config.stage2.noise * jax.random.normal(key, targets[0].shape)
 
     def body(latent, inputs):
@@ -175,9 +186,7 @@ def make_update(
         new = (params, average, optimizer_state)
         old = (state.params, state.average, state.optimizer)
         params, average, optimizer_state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
-        new = state._replace(
-            step=state.step + 1, params=params, average=average, optimizer=optimizer_state
-        )
+        new = state._replace(step=state.step + 1, params=params, average=average, optimizer=optimizer_state)
         return new, {"loss": value, "gradient_norm": norm, "nonfinite": ~good}
 
     @partial(jax.jit, donate_argnums=0)

@@ -52,9 +52,7 @@ def asset(name: str | Path) -> Path:
         if (folder / f"{name}.h5").is_file():
             return folder / f"{name}.h5"
     known = ", ".join(n for kind in ("body", "garment", "motion") for n in asset_names(kind))
-    raise ValueError(
-        f"nothing embedded is called {str(name)!r}: give the path of a file (.h5), or one of {known}"
-    )
+    raise ValueError(f"nothing embedded is called {str(name)!r}: give the path of a file (.h5), or one of {known}")
 
 
 def asset_names(kind: str) -> tuple[str, ...]:
@@ -142,9 +140,7 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
             raise ValueError(f"{file.filename}: attribute 'fps' must be a number > 0, got {fps!r}")
         if np.median(np.abs(translation[:, 1])) > 20:
             height = np.median(np.abs(translation[:, 1]))
-            raise ValueError(
-                f"{file.filename}: root height {height:.0f} m looks like centimetres: divide by 100"
-            )
+            raise ValueError(f"{file.filename}: root height {height:.0f} m looks like centimetres: divide by 100")
         names = _names(file, sizes)
         if joint_names is not None and names != tuple(joint_names):
             _refuse_joints(file, names, tuple(joint_names))
@@ -198,9 +194,7 @@ def save_body(
     _write(path, "body", data, name=name, source=source, licence=licence)
 
 
-def save_garment(
-    path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str
-) -> None:
+def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str) -> None:
     """Writes a garment, whole or not at all; `body` names the body it was made for."""
     data = {
         "vertices": np.float32(garment.vertices),
@@ -292,9 +286,7 @@ def _dataset(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int]) ->
     return file[name][()]
 
 
-def _floats(
-    file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], dtype: type = np.float32
-) -> np.ndarray:
+def _floats(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], dtype: type = np.float32) -> np.ndarray:
     value = _dataset(file, name, shape, sizes)
     if value.dtype.kind not in "fiu":
         raise ValueError(f"{file.filename}: dataset {name!r} must hold numbers, got {value.dtype}")
@@ -308,18 +300,14 @@ def _floats(
     return value.astype(dtype)
 
 
-def _integers(
-    file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], low: int, high: int
-) -> np.ndarray:
+def _integers(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], low: int, high: int) -> np.ndarray:
     value = _dataset(file, name, shape, sizes)
     if value.dtype.kind not in "iu":
         raise ValueError(f"{file.filename}: dataset {name!r} must hold integers, got {value.dtype}")
     wrong = np.argwhere((value < low) | (value >= high))
     if len(wrong):
         where = tuple(int(i) for i in wrong[0])
-        raise ValueError(
-            f"{file.filename}: dataset {name!r} is {value[where]} at {where}, allowed {low} to {high - 1}"
-        )
+        raise ValueError(f"{file.filename}: dataset {name!r} is {value[where]} at {where}, allowed {low} to {high - 1}")
     return value.astype(np.int32)
 
 
@@ -328,9 +316,7 @@ def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) 
     a, b, c = faces.T
     twice = np.flatnonzero((a == b) | (b == c) | (c == a))
     if len(twice):
-        raise ValueError(
-            f"{file.filename}: face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it"
-        )
+        raise ValueError(f"{file.filename}: face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it")
     return faces
 
 
@@ -377,23 +363,15 @@ def _check_size(file: h5py.File, what: str, size: float, low: float, high: float
         return
     for unit, factor in (("centimetres", 100), ("millimetres", 1000)):
         if low <= size / factor <= high:
-            raise ValueError(
-                f"{file.filename}: {what} {size:g} m looks like {unit}: divide lengths by {factor}"
-            )
+            raise ValueError(f"{file.filename}: {what} {size:g} m looks like {unit}: divide lengths by {factor}")
     raise ValueError(f"{file.filename}: {what} is {size:g} m, allowed {low} to {high}")
 
 
 def _refuse_joints(file: h5py.File, found: tuple[str, ...], wanted: tuple[str, ...]) -> None:
     lacking = [n for n in wanted if n not in found]
     further = [n for n in found if n not in wanted]
-    text = (
-        f"lacks {lacking}, has {further} besides"
-        if lacking or further
-        else f"has another order, {list(found)}"
-    )
-    raise ValueError(
-        f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)"
-    )
+    text = f"lacks {lacking}, has {further} besides" if lacking or further else f"has another order, {list(found)}"
+    raise ValueError(f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)")
 
 
 def _write(path: str | Path, kind: str, data: dict[str, np.ndarray], **attributes) -> None:

@@ -111,9 +111,7 @@ def _corners(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _checked(faces: np.ndarray, vertex_count: int | None = None) -> np.ndarray:
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-        raise ValueError(
-            f"faces must be integers [F, 3], not {faces.dtype} {list(faces.shape)}; triangulate the mesh"
-        )
+        raise ValueError(f"faces must be integers [F, 3], not {faces.dtype} {list(faces.shape)}; triangulate the mesh")
     limit = int(faces.max(initial=-1)) + 1 if vertex_count is None else vertex_count
     outside = ((faces < 0) | (faces >= limit)).any(axis=1)
     if outside.any():
@@ -125,7 +123,5 @@ def _checked(faces: np.ndarray, vertex_count: int | None = None) -> np.ndarray:
     repeated = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     if repeated.any():
         face = int(np.argmax(repeated))
-        raise ValueError(
-            f"face {face} is {faces[face].tolist()}: its vertices must differ; remove such faces"
-        )
+        raise ValueError(f"face {face} is {faces[face].tolist()}: its vertices must differ; remove such faces")
     return faces.astype(np.int32)

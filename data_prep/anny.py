@@ -72,9 +72,7 @@ def coefficients(words: list[tuple[str, ...]], phenotype: dict[str, float]) -> n
     share = {AGE: 1.0} | {race: phenotype[race] for race in RACES}
     for name, ladder in LADDERS.items():
         steps = np.linspace(0, 1, len(ladder))
-        share |= {
-            word: np.interp(phenotype[name], steps, row) for word, row in zip(ladder, np.eye(len(ladder)))
-        }
+        share |= {word: np.interp(phenotype[name], steps, row) for word, row in zip(ladder, np.eye(len(ladder)))}
     return np.array([np.prod([share[word] for word in target]) for target in words])
 
 
@@ -146,9 +144,7 @@ def build(template: Template, vertices: int = 6890, betas: int = 10, people: int
     coarse, triangles = fast_simplification.simplify(
         skin.astype(np.float32), faces.astype(np.int32), target_count=2 * vertices, agg=5
     )
-    _, face, foot = igl.point_mesh_squared_distance(coarse.astype(np.float64), skin, faces.astype(np.int64))[
-        :3
-    ]
+    _, face, foot = igl.point_mesh_squared_distance(coarse.astype(np.float64), skin, faces.astype(np.int64))[:3]
     corners = faces[face]
     share = igl.barycentric_coordinates(foot, *(np.ascontiguousarray(skin[c]) for c in corners.T))
     weights = np.einsum("vk,vkj->vj", share, template.weights[used][corners])
@@ -295,9 +291,7 @@ def _head(place: dict, cubes: dict[str, np.ndarray]) -> np.ndarray:
 def _triangles(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Each quad cut along its shorter diagonal."""
     a, b, c, d = quads.T
-    first = np.sum((vertices[a] - vertices[c]) ** 2, axis=1) <= np.sum(
-        (vertices[b] - vertices[d]) ** 2, axis=1
-    )
+    first = np.sum((vertices[a] - vertices[c]) ** 2, axis=1) <= np.sum((vertices[b] - vertices[d]) ** 2, axis=1)
     along_ac = np.stack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)], axis=1)
     along_bd = np.stack([np.stack([a, b, d], axis=1), np.stack([b, c, d], axis=1)], axis=1)
     return np.where(first[:, None, None], along_ac, along_bd).reshape(-1, 3)

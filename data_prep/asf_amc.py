@@ -94,15 +94,11 @@ def read_asf(path: str | Path) -> Skeleton:
         elif section == ":hierarchy" and key not in ("begin", "end"):
             for child in words[1:]:
                 if child not in bones or (key != "root" and key not in parents):
-                    raise ValueError(
-                        f"{path}, line {line}: {words[0]} or {child} is not a bone known by here"
-                    )
+                    raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone known by here")
                 parents[child] = words[0]
     if not bones or set(parents) != set(bones):
         loose = sorted(set(bones) - set(parents))
-        raise ValueError(
-            f"{path}, line {line}: no complete :hierarchy (bones without parent: {loose}); cut short?"
-        )
+        raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {loose}); cut short?")
     return Skeleton(bones, parents, degrees, order)
 
 
@@ -158,9 +154,7 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
 def _bone(path: str | Path, line: int, entry: dict, degrees: bool) -> tuple[str, Bone]:
     missing = {"name", "direction", "length", "axis"} - set(entry)
     if missing or not entry["name"][1]:
-        raise ValueError(
-            f"{path}, line {line}: the bone that ends here lacks {', '.join(sorted(missing)) or 'a name'}"
-        )
+        raise ValueError(f"{path}, line {line}: the bone that ends here lacks {', '.join(sorted(missing)) or 'a name'}")
     direction = np.array(numbers(path, entry["direction"][0], entry["direction"][1], 3))
     (length,) = numbers(path, entry["length"][0], entry["length"][1], 1)
     axis_line, axis = entry["axis"]
@@ -171,9 +165,7 @@ def _bone(path: str | Path, line: int, entry: dict, degrees: bool) -> tuple[str,
     dof_line, dof = entry.get("dof", (line, []))
     freedoms = [word.lower() for word in dof]
     if len(set(freedoms)) != len(freedoms) or not set(freedoms) <= {"rx", "ry", "rz"}:
-        raise ValueError(
-            f"{path}, line {dof_line}: dof {' '.join(dof)!r}, allowed are rx, ry and rz once each"
-        )
+        raise ValueError(f"{path}, line {dof_line}: dof {' '.join(dof)!r}, allowed are rx, ry and rz once each")
     return entry["name"][1][0], Bone(direction * length, frame, "".join(f[1] for f in freedoms))
 
 
@@ -218,9 +210,7 @@ def main(args: Arguments) -> None:
     licence = "of the recording; CMU's: free to use with credit, not to be resold (mocap.cs.cmu.edu)"
     name = args.motion.name.partition(".")[0]
     save_motion(args.output, motion, names, name=name, source=str(args.motion.name), licence=licence)
-    print(
-        f"{args.output}: {len(motion.translation)} frames, implausible: {bad_frames(motion, body).tolist()}"
-    )
+    print(f"{args.output}: {len(motion.translation)} frames, implausible: {bad_frames(motion, body).tolist()}")
 
 
 if __name__ == "__main__":

@@ -146,9 +146,7 @@ def main(args: Arguments) -> None:
     """Writes the file the arguments ask for, and says which frames are implausible."""
     body, names = load_body(args.body), joint_names(args.body)
     capture = read_bvh(args.motion)
-    capture = capture._replace(
-        rotations=capture.rotations[args.skip :], translation=capture.translation[args.skip :]
-    )
+    capture = capture._replace(rotations=capture.rotations[args.skip :], translation=capture.translation[args.skip :])
     motion = retarget(
         capture,
         body,
@@ -160,9 +158,7 @@ def main(args: Arguments) -> None:
     )
     name = args.motion.name.partition(".")[0]
     save_motion(args.output, motion, names, name=name, source=args.motion.name, licence=args.licence)
-    print(
-        f"{args.output}: {len(motion.translation)} frames, implausible: {bad_frames(motion, body).tolist()}"
-    )
+    print(f"{args.output}: {len(motion.translation)} frames, implausible: {bad_frames(motion, body).tolist()}")
 
 
 if __name__ == "__main__":

@@ -65,9 +65,7 @@ TEMPLATES = {
         waist=True,
         samples=500,
     ),
-    "dress": Template(
-        ("knee", 0.05), 4, blur=1.5, hull=("waist", 0.0, 0.22), sleeve=0.35, neck=0.02, samples=500
-    ),
+    "dress": Template(("knee", 0.05), 4, blur=1.5, hull=("waist", 0.0, 0.22), sleeve=0.35, neck=0.02, samples=500),
 }
 
 
@@ -185,9 +183,7 @@ def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
         side + bone for side in ("Left", "Right") for bone in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")
     }
     if needed - set(joint):
-        raise ValueError(
-            f"the body lacks the joints {sorted(needed - set(joint))}: name them as CMU or SMPL do"
-        )
+        raise ValueError(f"the body lacks the joints {sorted(needed - set(joint))}: name them as CMU or SMPL do")
     vertices = np.asarray(body.vertices, np.float64)
     tall = np.ptp(vertices[:, 1])
     height = {name: place[1] for name, place in joint.items()}
@@ -276,9 +272,7 @@ def _cuts(kind: Template, wearer: Wearer) -> list[Callable[[np.ndarray], np.ndar
     if kind.neck is not None:
         base, up = neck + np.array([0, 0.02 - kind.neck, 0]), np.array([0, 1, 0.35]) / np.hypot(1, 0.35)
         radius = 0.42 * broad
-        cuts.append(
-            lambda x: np.minimum((x - base) @ up, radius - np.hypot(x[:, 0] - base[0], x[:, 2] - base[2]))
-        )
+        cuts.append(lambda x: np.minimum((x - base) @ up, radius - np.hypot(x[:, 0] - base[0], x[:, 2] - base[2])))
     if kind.scoop is not None:
         for side, sign in (("Left", 1), ("Right", -1)):
             away = np.array([sign, 0.25, 0]) / np.hypot(1, 0.25)
@@ -286,17 +280,13 @@ def _cuts(kind: Template, wearer: Wearer) -> list[Callable[[np.ndarray], np.ndar
         middle, wide = neck + np.array([0, 0.01, 0]), 0.34 * broad
         cuts.append(
             lambda x: (
-                0.05
-                - 0.05 * ((x[:, 0] - middle[0]) / wide) ** 2
-                - 0.05 * ((x[:, 1] - middle[1]) / kind.scoop) ** 2
+                0.05 - 0.05 * ((x[:, 0] - middle[0]) / wide) ** 2 - 0.05 * ((x[:, 1] - middle[1]) / kind.scoop) ** 2
             )
         )
     return cuts
 
 
-def _beyond_plane(
-    point: np.ndarray, normal: np.ndarray, within: float = np.inf
-) -> Callable[[np.ndarray], np.ndarray]:
+def _beyond_plane(point: np.ndarray, normal: np.ndarray, within: float = np.inf) -> Callable[[np.ndarray], np.ndarray]:
     return lambda x: np.where(np.linalg.norm(x - point, axis=1) < within, (x - point) @ normal, -1.0)
 
 

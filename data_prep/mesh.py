@@ -9,9 +9,7 @@ def edge_table(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges [E, 2] with ascending ends, the edges ab, bc, ca of each face [F, 3], faces at each edge [E]."""
     halves = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     size = int(halves.max()) + 1
-    code, of_face, count = np.unique(
-        halves[:, 0] * size + halves[:, 1], return_inverse=True, return_counts=True
-    )
+    code, of_face, count = np.unique(halves[:, 0] * size + halves[:, 1], return_inverse=True, return_counts=True)
     return np.stack([code // size, code % size], axis=1), of_face.reshape(-1, 3), count
 
 
@@ -38,9 +36,7 @@ def components(links: np.ndarray, count: int) -> np.ndarray:
     return connected_components(coo_matrix((np.ones(len(a)), (a, b)), (count, count)), directed=False)[1]
 
 
-def component(
-    vertices: np.ndarray, faces: np.ndarray, near: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def component(vertices: np.ndarray, faces: np.ndarray, near: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The connected part with most faces, or the one with the vertex nearest to a point [3]."""
     label = components(faces, len(vertices))
     wanted = np.bincount(label[faces[:, 0]]).argmax()

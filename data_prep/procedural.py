@@ -56,9 +56,7 @@ class Pattern(NamedTuple):
             total[:, axis] += value
 
 
-def generate(
-    kind: str, seed: int = 0, seconds: float = 8.0, fps: float = 30.0, body: str | Path = "body"
-) -> Motion:
+def generate(kind: str, seed: int = 0, seconds: float = 8.0, fps: float = 30.0, body: str | Path = "body") -> Motion:
     """A motion of a kind on a body's joints, standing on y = 0.
 
     Args:
@@ -144,9 +142,7 @@ def _gait(pattern: Pattern, beat: Beat) -> None:
 def _jump(pattern: Pattern, beat: Beat) -> None:
     """Crouch, leap along a parabola with the arms thrown up, land into a crouch, stand."""
     phase = (beat.time * beat.rate) % 1
-    crouch = (
-        _step(phase, 0.0, 0.3) - _step(phase, 0.3, 0.42) + _step(phase, 0.62, 0.7) - _step(phase, 0.7, 0.95)
-    )
+    crouch = _step(phase, 0.0, 0.3) - _step(phase, 0.3, 0.42) + _step(phase, 0.62, 0.7) - _step(phase, 0.7, 0.95)
     leap = np.where((phase > 0.40) & (phase < 0.66), 1 - ((phase - 0.53) / 0.13) ** 2, 0).clip(0)
     ramp = beat.ramp
     for sign, side in SIDES:
@@ -215,9 +211,7 @@ def _matrices(degrees: np.ndarray) -> np.ndarray:
 
 def _find(names: tuple[str, ...], joint: str) -> int:
     if joint not in cmu_names(names):
-        raise ValueError(
-            f"the body has no joint {joint!r} (CMU) or SMPL's for it, only {', '.join(names)}: rename it"
-        )
+        raise ValueError(f"the body has no joint {joint!r} (CMU) or SMPL's for it, only {', '.join(names)}: rename it")
     return cmu_names(names).index(joint)
 
 

@@ -40,9 +40,7 @@ CMU_FROM_SMPL = {
     "right_foot": "RightToeBase",
 }
 _LIMBS = (("UpLeg", "Leg"), ("Leg", "Foot"), ("Foot", "ToeBase"), ("Arm", "ForeArm"), ("ForeArm", "Hand"))
-ALIGNED = {
-    f"{side}{a}": f"{side}{b}" for side in ("Left", "Right") for a, b in _LIMBS
-}  # joint: end of its bone
+ALIGNED = {f"{side}{a}": f"{side}{b}" for side in ("Left", "Right") for a, b in _LIMBS}  # joint: end of its bone
 FROZEN = ("Hand", "Finger", "Thumb", "Toe")
 
 
@@ -91,9 +89,7 @@ def retarget(
     source = {name: i for i, name in reversed(list(enumerate(capture.names)))}
     for needed in ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot"):
         if needed not in source:
-            raise ValueError(
-                f"the recording has no joint {needed!r}, only {', '.join(capture.names)}: rename them"
-            )
+            raise ValueError(f"the recording has no joint {needed!r}, only {', '.join(capture.names)}: rename them")
         if needed not in names:
             raise ValueError(f"the body has no joint {needed!r}, only {', '.join(names)}: rename them")
     rest = np.zeros_like(capture.offsets)
@@ -139,9 +135,7 @@ def resample(capture: Capture, fps: float) -> Capture:
     ratio = capture.fps / fps
     if abs(ratio - round(ratio)) < 1e-3 * ratio and round(ratio) >= 1:
         every = slice(None, None, round(ratio))
-        return capture._replace(
-            rotations=capture.rotations[every], translation=capture.translation[every], fps=fps
-        )
+        return capture._replace(rotations=capture.rotations[every], translation=capture.translation[every], fps=fps)
     old = np.arange(frames) / capture.fps
     new = np.arange(int(np.floor(old[-1] * fps + 1e-6)) + 1) / fps
     new = np.minimum(new, old[-1])

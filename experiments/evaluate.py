@@ -97,7 +97,10 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
     tracks["psi"] = psi_trajectory(psi, clip)
     done(1)
     solved, converged = metrics.simulate(
-        whole.scene, character, jax.tree.map(lambda x: x[: min(config.evaluation.solver_frames, frames)], poses), config
+        whole.scene,
+        character,
+        jax.tree.map(lambda x: x[: min(config.evaluation.solver_frames, frames)], poses),
+        config,
     )
     done(2)
     advance = np.asarray(poses.translation[:, 2])
@@ -117,7 +120,9 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
         result[stage] = measured
     done(4)
     np.savez_compressed(
-        run / f"trajectories_{name}.npz", **{k: np.asarray(v, np.float32) for k, v in tracks.items()}, solver=solved
+        run / f"trajectories_{name}.npz",
+        **{k: np.asarray(v, np.float32) for k, v in tracks.items()},
+        solver=solved,
     )
     return result
 

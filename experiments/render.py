@@ -68,9 +68,7 @@ def write_glb(run: Path, whole: Experiment, motion: str, out: Path, frames: int)
     clip = experiment.motion(whole, motion)
     garment = psi_trajectory(inference.load(run, betas=experiment.betas(whole.config)), clip)[:frames]
     body, root = body_trajectory(whole, clip)
-    return gltf.to_glb(
-        out, garment, whole.garment.faces, body[:frames], whole.body.faces, root[:frames], clip.fps
-    )
+    return gltf.to_glb(out, garment, whole.garment.faces, body[:frames], whole.body.faces, root[:frames], clip.fps)
 
 
 def write_comparison(run: Path, whole: Experiment, motion: str, out: Path, frames: int = 0) -> None:

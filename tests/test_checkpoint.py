@@ -63,9 +63,7 @@ def test_the_whole_state_comes_back_exactly(tmp_path):
         restored, about = checkpoint.restore(tmp_path / "c", like)
     assert_same(restored, state)
     assert isinstance(restored, State)
-    np.testing.assert_array_equal(
-        jax.vmap(jax.random.normal)(restored.key), jax.vmap(jax.random.normal)(state.key)
-    )
+    np.testing.assert_array_equal(jax.vmap(jax.random.normal)(restored.key), jax.vmap(jax.random.normal)(state.key))
     assert (about.step, about.config, about.description) == (7, {"a": {"b": [1, 2.5, None]}}, "a shirt")
     assert checkpoint.latest(tmp_path / "c") == about
 
@@ -211,9 +209,7 @@ for step in itertools.count(1):
 
 
 def test_kill_minus_nine_leaves_the_last_complete_checkpoint(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-c", SAVE_FOREVER, tmp_path], stdout=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-c", SAVE_FOREVER, tmp_path], stdout=subprocess.PIPE, text=True)
     for _ in range(3):
         done = int(process.stdout.readline())
     time.sleep(0.02)  # into the next save

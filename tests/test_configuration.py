@@ -140,9 +140,7 @@ def test_mistakes_name_the_file_and_the_place(tmp_path, text, parts):
 
 def test_a_mistake_in_a_parent_names_the_parent(tmp_path):
     write(tmp_path, "parent.yaml", "train: {stps: 3, density: {low: 5, high: 6}}\n")
-    with pytest.raises(
-        ValueError, match=r"parent\.yaml: train\.stps: unknown key; did you mean 'steps'"
-    ) as error:
+    with pytest.raises(ValueError, match=r"parent\.yaml: train\.stps: unknown key; did you mean 'steps'") as error:
         load(tmp_path, "extends: parent.yaml\ntrain: {steps: 3}\n")
     assert "c.yaml" not in str(error.value)
     write(tmp_path, "parent.yaml", "train: {density: {low: 5, high: 6}}\n")
@@ -159,9 +157,7 @@ def test_a_longer_cycle_is_refused(tmp_path):
 
 def test_overrides_go_on_top_of_the_file(tmp_path):
     text = "train: {steps: 5, clip: 9}\nhidden: [1, 2]\n"
-    config = load(
-        tmp_path, text, "--train.learning_rate", "3e-4", "--hidden", "4", "5", "6", "--train.clip", "None"
-    )
+    config = load(tmp_path, text, "--train.learning_rate", "3e-4", "--hidden", "4", "5", "6", "--train.clip", "None")
     assert (config.train.learning_rate, config.train.steps, config.train.clip) == (3e-4, 5, None)
     assert config.hidden == (4, 5, 6)
 
@@ -179,10 +175,7 @@ def test_mistaken_overrides_end_with_a_message(tmp_path, capsys, overrides, said
         load(tmp_path, "", *overrides)
     assert stop.value.code not in (0, None)
     printed = capsys.readouterr()
-    assert (
-        said in printed.err.replace("-", "_") + printed.out.replace("-", "_")
-        or said in printed.err + printed.out
-    )
+    assert said in printed.err.replace("-", "_") + printed.out.replace("-", "_") or said in printed.err + printed.out
 
 
 def test_command_line(tmp_path, capsys):

@@ -96,9 +96,7 @@ def test_the_plane_is_chosen_now_and_kept_for_the_step():
     np.testing.assert_array_equal(found.index, np.arange(len(vertices)))
     np.testing.assert_allclose(found.point, vertices, atol=1e-6)
     np.testing.assert_allclose(found.point_next, turned, atol=1e-6)
-    np.testing.assert_allclose(
-        np.asarray(found.normal_next), np.asarray(found.normal)[:, [1, 2, 0]], atol=1e-6
-    )
+    np.testing.assert_allclose(np.asarray(found.normal_next), np.asarray(found.normal)[:, [1, 2, 0]], atol=1e-6)
 
 
 def test_contact_moves_with_the_scene():

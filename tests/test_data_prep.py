@@ -315,9 +315,7 @@ def test_retarget_onto_itself_and_freeze(body, names):
     still = [i for i, n in enumerate(names) if any(part in n for part in retarget.FROZEN)]
     others = [i for i in range(31) if i not in still]
     np.testing.assert_allclose(frozen.rotations[:, others], recorded[:, others], atol=1e-6)
-    np.testing.assert_allclose(
-        frozen.rotations[:, still][0], np.tile(np.eye(3), (len(still), 1, 1)), atol=1e-6
-    )
+    np.testing.assert_allclose(frozen.rotations[:, still][0], np.tile(np.eye(3), (len(still), 1, 1)), atol=1e-6)
 
 
 def test_retarget_refuses_another_skeleton(body, names, tmp_path):
@@ -484,9 +482,7 @@ def test_garment_from_a_mesh(tmp_path, body):
     found = storage.load_garment(tmp_path / "shirt.h5", body)
     np.testing.assert_allclose(found.vertices, shirt.vertices, atol=1e-6)
     assert not found.pinned.any()
-    assert (
-        np.abs(found.weights - shirt.weights).sum(axis=1).mean() < 0.3
-    )  # the embedded one was made otherwise
+    assert np.abs(found.weights - shirt.weights).sum(axis=1).mean() < 0.3  # the embedded one was made otherwise
     assert np.abs(found.shapedirs - shirt.shapedirs).mean() < 2e-3
 
 
@@ -522,9 +518,7 @@ def test_target_weights():
 
 
 def test_t_pose_is_the_embedded_one(body, names):
-    np.testing.assert_allclose(
-        anny.to_t_pose(body.joints, names), storage.canonical_rotation("body"), atol=1e-6
-    )
+    np.testing.assert_allclose(anny.to_t_pose(body.joints, names), storage.canonical_rotation("body"), atol=1e-6)
 
 
 def test_reading_a_small_wheel(tmp_path):
@@ -538,9 +532,7 @@ def test_reading_a_small_wheel(tmp_path):
                 "root": {"parent": "", "head": {"strategy": "CUBE", "cube_name": "cube"}},
             }
         ),
-        "rigs/standard/weights.cmu_mb.json": json.dumps(
-            {"weights": {"root": [[0, 1], [1, 1.5]], "tip": [[1, 0.5]]}}
-        ),
+        "rigs/standard/weights.cmu_mb.json": json.dumps({"weights": {"root": [[0, 1], [1, 1.5]], "tip": [[1, 0.5]]}}),
     }
     path = tmp_path / "a.whl"
     with zipfile.ZipFile(path, "w") as wheel:

@@ -28,9 +28,14 @@ def finished(tmp_path_factory):
 def test_the_quickstart_leaves_everything_it_promises(finished):
     report = json.loads((finished / "report.json").read_text())
     for stage in ("lbs", "phi", "psi"):
-        assert {"energy_gap", "hold_gap", "step_error_mm", "penetration_percent", "edge_strain_p95", "jitter"} <= set(
-            report["evaluation"][stage]
-        )
+        assert {
+            "energy_gap",
+            "hold_gap",
+            "step_error_mm",
+            "penetration_percent",
+            "edge_strain_p95",
+            "jitter",
+        } <= set(report["evaluation"][stage])
     assert report["evaluation"]["lbs"]["energy_gap"] == pytest.approx(1.0)
     assert report["evaluation"]["psi"]["finite"] is True
     assert report["quickstart"]["train_seconds"] > 0

@@ -219,9 +219,7 @@ def test_a_few_skipped_updates_are_counted(tmp_path):
 
 def test_too_many_skipped_updates_in_a_row_stop_the_run(tmp_path):
     update = make_update(bad_steps=tuple(range(14, 40)))
-    with pytest.raises(
-        FloatingPointError, match=r"steps 15 to 19 had non-finite gradients, more than 4 in a row"
-    ):
+    with pytest.raises(FloatingPointError, match=r"steps 15 to 19 had non-finite gradients, more than 4 in a row"):
         train(tmp_path, update, max_nonfinite=4, checkpoint_seconds=0.0)
     assert checkpoint.steps(tmp_path / "checkpoints")[-1] == 16
 
@@ -238,17 +236,13 @@ def spoiled(spoil):
 
 def test_a_non_finite_loss_that_was_not_skipped_stops_the_run(tmp_path):
     update = spoiled(lambda state, metrics: (state, metrics | {"loss": metrics["loss"].at[1].set(jnp.inf)}))
-    with pytest.raises(
-        FloatingPointError, match=r"the loss of step 10 is inf; the last good checkpoint is .*8\. "
-    ):
+    with pytest.raises(FloatingPointError, match=r"the loss of step 10 is inf; the last good checkpoint is .*8\. "):
         train(tmp_path, update, checkpoint_seconds=0.0)
 
 
 def test_a_bad_state_is_never_saved(tmp_path):
     update = spoiled(lambda state, metrics: (state._replace(params={"w": jnp.full(3, jnp.nan)}), metrics))
-    with pytest.raises(
-        FloatingPointError, match=r"state of step 12 has NaN in .*'w'.*last good checkpoint is .*8\. "
-    ):
+    with pytest.raises(FloatingPointError, match=r"state of step 12 has NaN in .*'w'.*last good checkpoint is .*8\. "):
         train(tmp_path, update, checkpoint_seconds=0.0)
     assert checkpoint.steps(tmp_path / "checkpoints") == [4, 8]
 

@@ -17,9 +17,7 @@ CASES = ["grid", "gridred", "gridalt", "gridseed", "grids3", "two", "twoseed"]
 def sheet(rows: int, columns: int) -> np.ndarray:
     """Faces of a rows x columns grid of vertices."""
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (
-        corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:])
-    )
+    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
@@ -59,9 +57,7 @@ def test_coarse_levels_equal_hoods(shirt, centre):
     name = f"c{centre or 19}"
     for index, level in enumerate(levels):
         np.testing.assert_array_equal(level, golden[f"{name}_coarse{index}"])
-    np.testing.assert_array_equal(
-        graph_sampling.vertex_levels(4424, levels[:3]), golden[f"{name}_vertex_level3"]
-    )
+    np.testing.assert_array_equal(graph_sampling.vertex_levels(4424, levels[:3]), golden[f"{name}_vertex_level3"])
 
 
 def test_the_default_centre_is_hoods_first(shirt):

@@ -98,6 +98,4 @@ def test_no_cycles():
 
 def test_inside_the_library_nothing_imports_the_package_itself():
     for name in MODULES:
-        assert "clothjax" not in GRAPH[name] or name == "clothjax", (
-            f"{name} imports the public names of clothjax"
-        )
+        assert "clothjax" not in GRAPH[name] or name == "clothjax", f"{name} imports the public names of clothjax"

@@ -97,7 +97,7 @@ def test_wrong_betas_are_refused(trained):
 
 
 def test_the_teacher_starts_from_zero_and_its_inputs_are_what_an_engine_has(trained):
-    model, motion, teacher = trained
+    model, _motion, teacher = trained
     assert (teacher.latents[:, 0] == 0).all()
     assert teacher.latents.shape[1] == teacher.poses.shape[1] + 1
     kept = len(model.kept)

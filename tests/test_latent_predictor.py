@@ -12,7 +12,7 @@ from clothjax.types import Material
 
 
 def test_smpl_gives_the_input_count_of_the_thesis():
-    names = tuple(f"joint{i}" for i in range(20)) + ("LeftHand", "RightHand", "LThumb", "RThumb")
+    names = (*tuple(f"joint{i}" for i in range(20)), "LeftHand", "RightHand", "LThumb", "RThumb")
     kept = latent_predictor.kept_joints(names, Config().stage2)
     parents = np.array([-1, *range(23)])
     rotations = jnp.broadcast_to(jnp.eye(3), (3, 24, 3, 3))

@@ -23,9 +23,7 @@ def strict():
 def sheet(rows: int, columns: int) -> np.ndarray:
     """Faces of a rows x columns grid of vertices."""
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (
-        corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:])
-    )
+    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
@@ -78,9 +76,7 @@ def test_values_and_gradients_equal_the_golden_layers(layer, basis_first, monkey
     for ours, theirs in NAMES.items():
         assert (ours in grads) == (f"grad_{theirs}" in golden)
         if ours in grads:
-            np.testing.assert_allclose(
-                grads[ours], golden[f"grad_{theirs}"], rtol=0, atol=1e-10, err_msg=ours
-            )
+            np.testing.assert_allclose(grads[ours], golden[f"grad_{theirs}"], rtol=0, atol=1e-10, err_msg=ours)
 
 
 def test_padding_has_no_effect_and_no_gradient():

@@ -68,9 +68,7 @@ def test_hood_energies(hood, roll, x64):
     now, velocity = hood["cloth"][roll].copy(), hood["velocity"][roll].copy()
     now[hood["pinned"]], velocity[hood["pinned"]] = hood["cloth_target"][roll], 0.0
     new = hood["predicted"][roll]
-    body, following = (
-        contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body", "body_next")
-    )
+    body, following = (contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body", "body_next"))
     touched = contact.find(now, body, following)
     values = {
         "stretching_energy": physics.stretching(new[mesh.faces], rest.inverse, rest.face_area, MU, LAM),
@@ -78,9 +76,7 @@ def test_hood_energies(hood, roll, x64):
         "gravitational_energy": physics.gravity(new[:, 1], mass),
         "inertia": physics.inertia(new - now - velocity, mass, hood["timestep"][roll]),
         # never in contact here: this one says only that no vertex is found inside
-        "collision_penalty": physics.collision(
-            contact.distance(new, touched.point_next, touched.normal_next), 2e-3
-        ),
+        "collision_penalty": physics.collision(contact.distance(new, touched.point_next, touched.normal_next), 2e-3),
     }
     expected = dict(zip(hood["loss_names"], hood["losses"][roll]))
     for name, value in values.items():
@@ -99,9 +95,7 @@ def test_hood_friction_with_its_traps(hood, x64):
         contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body_previous", "body")
     )
     p, q = contact.nearest(now, before[0]), contact.nearest(new, after[0])
-    near = (np.sum((now - before[0][p]) ** 2, axis=1) < 3e-3) & (
-        np.sum((new - after[0][q]) ** 2, axis=1) < 3e-3
-    )
+    near = (np.sum((now - before[0][p]) ** 2, axis=1) < 3e-3) & (np.sum((new - after[0][q]) ** 2, axis=1) < 3e-3)
     slip = new - (now + after[0][p] - before[0][p])
     normal = 0.5 * (before[1][p] + after[1][q])
     z_to_y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -240,9 +234,7 @@ def test_friction_in_closed_form(x64):
     kappa = np.sqrt(1 - np.array([0.0, 1.0, 0.8]) ** 2 + 1e-4)
     expected = 0.5 * 9.81 * 2.0 * kappa * np.array([3e-3, 4e-3, 5e-3])
     everywhere = np.ones(3, bool)
-    np.testing.assert_allclose(
-        physics.friction(slip, normal, mass, everywhere, 0.5, 0.0), expected, rtol=1e-12
-    )
+    np.testing.assert_allclose(physics.friction(slip, normal, mass, everywhere, 0.5, 0.0), expected, rtol=1e-12)
     # smoothing vanishes with its length, to first order
     for smoothing in (1e-6, 1e-7):
         smooth = physics.friction(slip, normal, mass, everywhere, 0.5, smoothing)
@@ -292,9 +284,7 @@ def test_free_fall_is_the_minimum_of_gravity_and_inertia(x64):
 
 def test_collision_is_the_cube_of_the_penetration(x64):
     distance = np.array([-2e-3, 0.0, 2.999e-3, 3e-3, 1.0])
-    np.testing.assert_allclose(
-        physics.collision(distance), [1.25e-7, 2.7e-8, 1e-18, 0.0, 0.0], rtol=1e-6, atol=1e-30
-    )
+    np.testing.assert_allclose(physics.collision(distance), [1.25e-7, 2.7e-8, 1e-18, 0.0, 0.0], rtol=1e-6, atol=1e-30)
 
 
 def test_rest_measures_are_those_of_numpy(x64):

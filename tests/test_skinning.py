@@ -100,9 +100,7 @@ def test_garments_are_shaped_like_bodies():
     body, betas = random_body(np.float32), np.array([1, 0, -2, 0.5], np.float32)
     pinned = np.zeros(len(body.vertices), bool)
     garment = Garment(body.vertices, body.faces, body.weights, body.shapedirs, pinned)
-    np.testing.assert_array_equal(
-        skinning.shaped_vertices(garment, betas), skinning.shaped_vertices(body, betas)
-    )
+    np.testing.assert_array_equal(skinning.shaped_vertices(garment, betas), skinning.shaped_vertices(body, betas))
 
 
 def test_turning_the_root_turns_the_body_about_it(x64):
@@ -118,16 +116,12 @@ def test_turning_the_root_turns_the_body_about_it(x64):
 
 def test_unapply_inverts_apply(x64):
     body, pose = random_body(), random_pose()
-    transforms = skinning.blend(
-        body.weights, skinning.joint_transforms(pose.rotations, body.joints, body.parents)
-    )
+    transforms = skinning.blend(body.weights, skinning.joint_transforms(pose.rotations, body.joints, body.parents))
     determinant = np.linalg.det(np.asarray(transforms)[:, :, :3])
     sound = np.abs(determinant) > 1e-3
     assert sound.sum() > 20
     posed = skinning.apply(transforms, body.vertices)
-    np.testing.assert_allclose(
-        np.asarray(skinning.unapply(transforms, posed))[sound], body.vertices[sound], atol=1e-11
-    )
+    np.testing.assert_allclose(np.asarray(skinning.unapply(transforms, posed))[sound], body.vertices[sound], atol=1e-11)
     inverse = np.linalg.inv(np.asarray(transforms)[sound, :, :3])
     np.testing.assert_allclose(
         np.asarray(skinning.unapply_direction(transforms, body.vertices))[sound],

@@ -130,9 +130,7 @@ def test_the_gradient_vanishes_where_it_says():
     weights = physics.GRAVITY * step.mass[~pinned]
     assert info.converged and info.relative_gradient <= 1e-6
     np.testing.assert_allclose(np.linalg.norm(gradient), info.gradient_norm, rtol=1e-6)
-    np.testing.assert_allclose(
-        info.relative_gradient, info.gradient_norm / np.linalg.norm(weights), rtol=1e-12
-    )
+    np.testing.assert_allclose(info.relative_gradient, info.gradient_norm / np.linalg.norm(weights), rtol=1e-12)
     np.testing.assert_allclose(info.energy, value, rtol=1e-12)
     np.testing.assert_array_equal(new[pinned], step.position[pinned])
 
@@ -156,8 +154,7 @@ def test_the_result_is_a_minimum():
     new, info = solver.solve_step(step.position, step, mesh, nothing_pinned(step), CONFIG)
     evaluate = potential(step, mesh)
     columns = [
-        (evaluate(new.reshape(-1) + h)[1] - evaluate(new.reshape(-1) - h)[1]) / 2e-7
-        for h in 1e-7 * np.eye(new.size)
+        (evaluate(new.reshape(-1) + h)[1] - evaluate(new.reshape(-1) - h)[1]) / 2e-7 for h in 1e-7 * np.eye(new.size)
     ]
     assert info.converged
     assert np.linalg.eigvalsh(0.5 * (np.array(columns) + np.transpose(columns))).min() > 0
@@ -167,9 +164,7 @@ def hessian_matrices(x, step, mesh):
     pattern = solver.structure(mesh, len(x))
     with jax.enable_x64(True):
         blocks = solver.hessians(x, jax.tree.map(jnp.asarray, step), mesh, pattern, CONFIG)
-    return [
-        scipy.sparse.bsr_array((np.asarray(b), pattern.indices, pattern.indptr)).toarray() for b in blocks
-    ]
+    return [scipy.sparse.bsr_array((np.asarray(b), pattern.indices, pattern.indptr)).toarray() for b in blocks]
 
 
 def test_hessian_is_that_of_finite_differences():

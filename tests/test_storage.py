@@ -162,9 +162,7 @@ def test_failed_write_leaves_the_old_file(tmp_path):
     path = _save(tmp_path)
     before = path.read_bytes()
     with pytest.raises(ValueError):
-        storage.save_body(
-            path, _body()._replace(faces=[[0], [1, 2]]), "abc", name="b", source="t", licence="t"
-        )
+        storage.save_body(path, _body()._replace(faces=[[0], [1, 2]]), "abc", name="b", source="t", licence="t")
     with pytest.raises(TypeError):  # fails inside HDF5, after the first datasets
         storage._write(path, "body", {"a": np.zeros(3), "b": np.array([object()])}, name="b")
     assert path.read_bytes() == before

@@ -13,9 +13,7 @@ TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 def sheet(rows: int, columns: int) -> np.ndarray:
     """Faces of a rows x columns grid of vertices."""
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (
-        corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:])
-    )
+    a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]))
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 

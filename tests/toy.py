@@ -27,16 +27,16 @@ def shrink(config: Config) -> Config:
             blendshapes=9,
         ),
         stage1=dataclasses.replace(config.stage1, steps=40, pool=3, rollout_every=1000),
-        stage2=dataclasses.replace(
-            config.stage2, steps=40, batch=4, rollout=2, hidden=(16,), sequences=2, frames=6
-        ),
+        stage2=dataclasses.replace(config.stage2, steps=40, batch=4, rollout=2, hidden=(16,), sequences=2, frames=6),
         evaluation=dataclasses.replace(config.evaluation, gap_frames=1, solver_frames=12, long_frames=40),
     )
 
 
 def small() -> Config:
     """The default experiment, shrunk, with two convolution blocks and one coarse level."""
-    return shrink(dataclasses.replace(Config(), model=dataclasses.replace(Config().model, convolution=(Level(6), Level(6)))))
+    return shrink(
+        dataclasses.replace(Config(), model=dataclasses.replace(Config().model, convolution=(Level(6), Level(6))))
+    )
 
 
 def assert_same(one, other) -> None:

@@ -73,9 +73,7 @@ def to_glb(
         primitive = gltf.Primitive(attributes=attributes, indices=corners, material=index, targets=morphs)
         meshes.append(gltf.Mesh(name=part.name, primitives=[primitive], weights=[0.0] * len(targets)))
         nodes.append(gltf.Node(name=part.name, mesh=index))
-        base = gltf.PbrMetallicRoughness(
-            baseColorFactor=[*part.colour, 1.0], metallicFactor=0.0, roughnessFactor=0.9
-        )
+        base = gltf.PbrMetallicRoughness(baseColorFactor=[*part.colour, 1.0], metallicFactor=0.0, roughnessFactor=0.9)
         materials.append(gltf.Material(name=part.name, pbrMetallicRoughness=base, doubleSided=True))
         for values, kind in ((moved, "translation"), (writer.add(weights.reshape(-1), "SCALAR"), "weights")):
             samplers.append(gltf.AnimationSampler(input=times, output=values, interpolation="LINEAR"))
@@ -104,13 +102,18 @@ def principal_components(vertices: np.ndarray, tolerance: float, most: int):
     left, size, right = np.linalg.svd((vertices - mean).reshape(len(vertices), -1), full_matrices=False)
     weights = left * size
     count = 0
-    for count in range(1, min(most, len(size)) + 1):  # noqa: B007
+    for count in range(1, min(most, len(size)) + 1):
         rebuilt = (weights[:, :count] @ right[:count]).reshape(vertices.shape) + mean
         error = float(np.linalg.norm(rebuilt - vertices, axis=-1).max())
         if error <= tolerance:
             break
     components = right[:count].reshape(count, *mean.shape)
-    return mean.astype(np.float32), components.astype(np.float32), weights[:, :count].astype(np.float32), error
+    return (
+        mean.astype(np.float32),
+        components.astype(np.float32),
+        weights[:, :count].astype(np.float32),
+        error,
+    )
 
 
 def _normal_change(mean: np.ndarray, target: np.ndarray, faces: np.ndarray) -> np.ndarray:
