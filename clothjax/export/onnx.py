@@ -56,7 +56,7 @@ def to_onnx(model: Model, path: str | Path, first: Pose) -> Path:
         "up": "+Y",
         "fps": config.fps,
         "inputs": {name: list(shape.shape) for name, shape in zip(INPUTS, shapes)},
-        "outputs": {name: list(shape) for name, shape in zip(OUTPUTS, (*(x.shape for x in state), model.garment.vertices.shape))},
+        "outputs": dict(zip(OUTPUTS, [*(list(x.shape) for x in state), list(model.garment.vertices.shape)])),
         "rotations": "3 x 3 matrices, row-major, local to the parent joint; the identity is the body's canonical pose",
         "translation": "of the root joint from its canonical place",
         "parents": list(model.parents),
