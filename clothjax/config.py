@@ -204,14 +204,17 @@ class Stage2Config:
     """Frames predicted in a row in one update."""
     noise: float = 0.3
     """Standard deviation of the noise on Z_t, in standard deviations of Z."""
+    vertex_share: float = 0.5
+    """Of the loss, taken by the error of the decoded vertices; the rest is that of the code (21). Both are shares of a
+    variance, so that parts of the code that move nothing do not crowd out those that do."""
     pushforward: bool = False
     """Only the last frame of the rollout is trained, the others without gradient."""
     hidden: tuple[int, ...] = (512, 512)
     learning_rate: float = 1e-3
     clip: float = 1.0
-    sequences: int = 64
+    sequences: int = 320
     """Teacher rollouts, each of its own betas and material ..."""
-    frames: int = 160
+    frames: int = 40
     """... and this many frames."""
     excluded_joints: tuple[str, ...] = ("Hand", "Finger", "Thumb", "Toe")
     """Joints whose names contain one of these are not inputs."""

@@ -12,9 +12,9 @@ import optax
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import latent_predictor, rollout, stage1
+from clothjax import garment_model, latent_predictor, rollout, stage1
 from clothjax.clips import Clips
-from clothjax.config import Config
+from clothjax.config import Config, ModelConfig
 from clothjax.latent_predictor import Normalizers
 from clothjax.scene import Scene
 from clothjax.types import Array, Pose
@@ -37,6 +37,7 @@ class TrainingState(NamedTuple):
     average: dict
     optimizer: optax.OptState
     normalizers: Normalizers
+    metric: Array  # [K, K] the mean squared vertex error of blend-weight errors, over the vertices' variance
     garment: dict  # the frozen decoder and blend shapes: with them, a checkpoint is a whole Psi
 
 
@@ -102,6 +103,7 @@ def init(teacher: Teacher, garment: dict, config: Config) -> TrainingState:
         params=params,
         average=jax.tree.map(jnp.array, params),
         optimizer=optimizer(config).init(params),
+        metric=vertex_metric(garment, teacher.latents[:, 1:].reshape(-1, size), config.model),
         garment=jax.tree.map(jnp.array, garment),
         normalizers=Normalizers(
             latent=latent_predictor.measure(teacher.latents[:, 1:].reshape(-1, size)),
@@ -119,37 +121,61 @@ def optimizer(config: Config) -> optax.GradientTransformation:
     )
 
 
+def vertex_metric(garment: dict, latents: np.ndarray, model: ModelConfig) -> Array:
+    """Matrix M [K, K] such that w^T M w is the mean squared displacement of vertices, as a share of its variance.
+
+    Args:
+        latents: [N, L] codes over which the variance is taken.
+    """
+    weights = jax.vmap(lambda z: garment_model.blend_weights(garment, z, model))(jnp.asarray(latents))
+    shapes = garment["blendshapes"].reshape(garment["blendshapes"].shape[0], -1)
+    gram = shapes @ shapes.T
+    spread = weights - jnp.mean(weights, axis=0, keepdims=True)
+    return gram / jnp.mean(jnp.einsum("nk,kl,nl->n", spread, gram, spread))
+
+
 def rollout_loss(
     params: dict,
-    normalizers: Normalizers,
+    state: TrainingState,
     latents: Array,
     poses: Array,
     constants: Array,
     key: Array,
     config: Config,
 ) -> Array:
-    """Mean squared error of one closed-loop rollout, in variances of the code.
+    """Mean squared error of one closed-loop rollout of the predictor `params`, as a share of the variance.
 
     Z_t is perturbed, so that the predictor learns to come back: plain one-step regression diverges in closed loop.
 
     Args:
+        state: for its normalizers, metric and decoder.
         latents: [H + 1, L] teacher codes; poses: [H, P]; constants: [C]; key: of the noise.
     """
+    stage, normalizers = config.stage2, state.normalizers
     targets = jax.vmap(lambda z: latent_predictor.normalise(normalizers.latent, z))(latents)
     poses = jax.vmap(lambda x: latent_predictor.normalise(normalizers.pose, x, bound=latent_predictor.POSE_BOUND))(
         poses
     )
-    noise = config.stage2.noise * jax.random.normal(key, targets[0].shape)
+    noise = stage.noise * jax.random.normal(key, targets[0].shape)
+
+    def weights(latent):
+        return garment_model.blend_weights(
+            state.garment, latent_predictor.denormalise(normalizers.latent, latent), config.model
+        )
 
     def body(latent, inputs):
         pose, target = inputs
-        if config.stage2.pushforward:
+        if stage.pushforward:
             latent = jax.lax.stop_gradient(latent)
         predicted = latent_predictor.predict(params, latent, pose, constants)
-        return predicted, jnp.mean((predicted - target) ** 2)
+        error = jnp.mean((predicted - target) ** 2)
+        if stage.vertex_share > 0:
+            apart = weights(predicted) - weights(target)
+            error = (1 - stage.vertex_share) * error + stage.vertex_share * apart @ state.metric @ apart
+        return predicted, error
 
     _, errors = jax.lax.scan(body, targets[0] + noise, (poses, targets[1:]))
-    return errors[-1] if config.stage2.pushforward else jnp.mean(errors)
+    return errors[-1] if stage.pushforward else jnp.mean(errors)
 
 
 def make_update(
@@ -160,7 +186,7 @@ def make_update(
     transform = optimizer(config)
     sequences, frames = teacher.poses.shape[:2]
 
-    def loss(params, normalizers, teacher, key):
+    def loss(params, state, teacher, key):
         keys = jax.random.split(key, 3)
         which = jax.random.randint(keys[0], (stage.batch,), 0, sequences)
         begin = jax.random.randint(keys[1], (stage.batch,), 0, frames - stage.rollout + 1)
@@ -169,13 +195,13 @@ def make_update(
             latents = jax.lax.dynamic_slice_in_dim(teacher.latents[sequence], begin, stage.rollout + 1)
             poses = jax.lax.dynamic_slice_in_dim(teacher.poses[sequence], begin, stage.rollout)
             constants = teacher.constants[sequence]
-            return rollout_loss(params, normalizers, latents, poses, constants, key, config)
+            return rollout_loss(params, state, latents, poses, constants, key, config)
 
         return jnp.mean(jax.vmap(one)(which, begin, jax.random.split(keys[2], stage.batch)))
 
     def one(teacher: Teacher, state: TrainingState, _):
         key = jax.random.fold_in(state.key, state.step)
-        value, gradient = jax.value_and_grad(loss)(state.params, state.normalizers, teacher, key)
+        value, gradient = jax.value_and_grad(loss)(state.params, state, teacher, key)
         norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm) & jnp.isfinite(value)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
