@@ -212,9 +212,9 @@ class Stage2Config:
     hidden: tuple[int, ...] = (512, 512)
     learning_rate: float = 1e-3
     clip: float = 1.0
-    sequences: int = 320
+    sequences: int = 128
     """Teacher rollouts, each of its own betas and material ..."""
-    frames: int = 40
+    frames: int = 120
     """... and this many frames."""
     excluded_joints: tuple[str, ...] = ("Hand", "Finger", "Thumb", "Toe")
     """Joints whose names contain one of these are not inputs."""

@@ -19,7 +19,7 @@ def sheet(count: int = 12):
 
 def test_what_is_in_front_hides_what_is_behind():
     vertices, faces = sheet()
-    red = Surface([*vertices, 0, 0, 0.01], faces, (1.0, 0.0, 0.0))
+    red = Surface(vertices + [0, 0, 0.01], faces, (1.0, 0.0, 0.0))
     blue = Surface(vertices - [0, 0, 0.01], faces, (0.0, 0.0, 1.0))
     camera = animation.camera_for(vertices, "front")
     for order in ([red, blue], [blue, red]):
@@ -43,7 +43,7 @@ def test_an_unknown_view_is_refused():
 
 def test_a_shadow_falls_on_the_floor():
     vertices, faces = sheet()
-    camera = animation.camera_for(np.concatenate([vertices, [*vertices, 0, 0, -2.0]]), "three-quarter", 2.5)
+    camera = animation.camera_for(np.concatenate([vertices, vertices + [0, 0, -2.0]]), "three-quarter", 2.5)
     plain = animation.render([Surface(vertices + 50, faces)], camera, (80, 80), floor=-0.6).astype(int)
     dark = animation.render([Surface(vertices, faces)], camera, (80, 80), floor=-0.6).astype(int)
     below = (plain.sum(-1) - dark.sum(-1))[60:]

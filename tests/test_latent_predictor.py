@@ -3,10 +3,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from clothjax import latent_predictor, stage2
+from clothjax import garment_model, latent_predictor, stage2
 from clothjax.config import Config, MaterialConfig
-from clothjax.latent_predictor import Normalizers
 from clothjax.stage2 import Teacher
 from clothjax.types import Material
 
@@ -61,11 +61,45 @@ def _rotating_teacher(sequences=24, frames=60, size=6, seed=0) -> Teacher:
     return Teacher(latents.astype(np.float32), poses.astype(np.float32), np.zeros((sequences, 3), np.float32))
 
 
+def _config(**stage) -> Config:
+    config = Config()
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, decoder=(8,)),
+        stage2=dataclasses.replace(config.stage2, **stage),
+    )
+
+
+def _garment(config, size=6, shapes=5, vertices=7):
+    basis = np.random.default_rng(1).normal(size=(shapes, vertices, 3)).astype(np.float32)
+    return garment_model.init(jax.random.key(2), size, basis, config.model)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_the_loss_is_the_vertex_error_over_the_vertices_variance(share):
+    teacher = _rotating_teacher(sequences=3, frames=5)
+    config = _config(vertex_share=share, noise=0.0, rollout=1, hidden=(8,))
+    garment = _garment(config)
+    state = stage2.init(teacher, garment, config)
+    decode = jax.vmap(lambda z: garment_model.displacement(garment, z, jnp.ones(7), config.model))
+    codes = jnp.asarray(teacher.latents[0, :2])
+    value = stage2.rollout_loss(
+        state.params, state, codes, jnp.asarray(teacher.poses[0, :1]), jnp.zeros(3), jax.random.key(0), config
+    )
+    normal = [latent_predictor.normalise(state.normalizers.latent, z) for z in codes]
+    pose = latent_predictor.normalise(state.normalizers.pose, jnp.asarray(teacher.poses[0, 0]))
+    predicted = latent_predictor.predict(state.params, normal[0], pose, jnp.zeros(3))
+    every = decode(jnp.asarray(teacher.latents[:, 1:].reshape(-1, 6)))
+    pair = decode(jnp.stack([latent_predictor.denormalise(state.normalizers.latent, predicted), codes[1]]))
+    vertex = jnp.mean((pair[0] - pair[1]) ** 2) / jnp.mean((every - every.mean(0, keepdims=True)) ** 2)
+    expected = (1 - share) * jnp.mean((predicted - normal[1]) ** 2) + share * vertex
+    np.testing.assert_allclose(value, expected, rtol=1e-4)
+
+
 def test_trained_with_noise_it_follows_its_teacher_in_closed_loop():
     teacher = _rotating_teacher()
-    stage = dataclasses.replace(Config().stage2, steps=600, hidden=(48,), batch=32, rollout=4, learning_rate=3e-3)
-    config = dataclasses.replace(Config(), stage2=stage)
-    state = stage2.init(teacher, {"w": np.zeros(1)}, config)
+    config = _config(steps=600, hidden=(48,), batch=32, rollout=4, learning_rate=3e-3)
+    state = stage2.init(teacher, _garment(config), config)
     state, _ = stage2.make_update(teacher, config, 600)(state)
     unseen = teacher  # its first sequence, but from end to end instead of four frames at a time
     normalizers = state.normalizers
@@ -84,14 +118,12 @@ def test_trained_with_noise_it_follows_its_teacher_in_closed_loop():
 
 def test_pushforward_has_no_gradient_through_its_own_steps():
     teacher = _rotating_teacher(sequences=2, frames=8)
-    normalizers = Normalizers(latent_predictor.measure(teacher.latents[0]), latent_predictor.measure(teacher.poses[0]))
-    params = latent_predictor.init(jax.random.key(0), 6, 4, 3, dataclasses.replace(Config().stage2, hidden=(8,)))
 
     def gradient(pushforward, noise):
-        stage = dataclasses.replace(Config().stage2, pushforward=pushforward, noise=noise, rollout=3)
-        config = dataclasses.replace(Config(), stage2=stage)
+        config = _config(pushforward=pushforward, noise=noise, rollout=3, hidden=(8,))
+        state = stage2.init(teacher, _garment(config), config)
         return jax.grad(stage2.rollout_loss)(
-            params, normalizers, jnp.asarray(teacher.latents[0, :4]), jnp.asarray(teacher.poses[0, :3]),
+            state.params, state, jnp.asarray(teacher.latents[0, :4]), jnp.asarray(teacher.poses[0, :3]),
             jnp.zeros(3), jax.random.key(1), config,
         )["dense_0"]["kernel"]  # fmt: skip
 
