@@ -199,12 +199,12 @@ class Stage2Config:
     """Training of the latent predictor on the frozen teacher (21)."""
 
     steps: int = 6000
-    batch: int = 64
-    rollout: int = 8
+    batch: int = 32
+    rollout: int = 16
     """Frames predicted in a row in one update."""
     noise: float = 0.3
     """Standard deviation of the noise on Z_t, in standard deviations of Z."""
-    vertex_share: float = 0.5
+    vertex_share: float = 0.8
     """Of the loss, taken by the error of the decoded vertices; the rest is that of the code (21). Both are shares of a
     variance, so that parts of the code that move nothing do not crowd out those that do."""
     pushforward: bool = False
