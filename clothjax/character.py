@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -81,7 +82,8 @@ def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig)
 
 def window(scene: Scene, character: Character, poses: Pose, config: PhysicsConfig) -> Window:
     """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
-    return Window(*(frame(scene, character, Pose(poses.rotations[i], poses.translation[i]), config) for i in range(3)))
+    frames = jax.vmap(lambda pose: frame(scene, character, pose, config))(poses)
+    return Window(*(jax.tree.map(lambda x: x[i], frames) for i in range(3)))
 
 
 def skinned(character: Character, frame: Frame) -> Array:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jax.experimental import multihost_utils
 from tqdm import tqdm
 
@@ -119,6 +120,40 @@ def fit(
         _say(f"{name}: saved step {call.step} of {steps} in {directory}; run the same command again to go on")
         raise SystemExit(128 + stop)
     return Fitted(state, seconds, compile_seconds)
+
+
+class Weights(NamedTuple):
+    """What gradient descent changes."""
+
+    params: Any
+    average: Any  # exponential moving average of params
+    optimizer: optax.OptState
+
+
+def descend(
+    transform: optax.GradientTransformation, weights: Weights, loss: jax.Array, gradient: Any, ema: float
+) -> tuple[Weights, Metrics]:
+    """One step of gradient descent; where the loss or a gradient is not finite, none.
+
+    Args:
+        gradient: of `loss`, like weights.params; ema: decay of the average in a step.
+
+    Returns:
+        The weights, and the metrics `loss`, `gradient_norm` and `nonfinite` that `fit` looks for.
+    """
+    norm = optax.tree.norm(gradient)
+    good = jnp.isfinite(norm) & jnp.isfinite(loss)
+
+    def step(weights: Weights) -> Weights:
+        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
+            updates, optimizer = transform.update(gradient, weights.optimizer, weights.params)
+        params = optax.apply_updates(weights.params, updates)
+        average = jax.tree.map(lambda a, p: ema * a + (1 - ema) * p, weights.average, params)
+        return Weights(params, average, optimizer)
+
+    # a branch, not a select of every array: half the program to compile
+    weights = jax.lax.cond(good, step, lambda same: same, weights)
+    return weights, {"loss": loss, "gradient_norm": norm, "nonfinite": ~good}
 
 
 def _calls(

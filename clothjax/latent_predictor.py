@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -43,13 +44,11 @@ def pose_inputs(
     root = int(kept[0])
     turn = rotation.heading(rotations[1, root]).T
     velocity = jnp.einsum("ab,nb->na", turn, advance, precision="highest") * fps
-    codes, positions = [], []
-    for k in range(3):
-        local = rotations[k].at[root].set(jnp.matmul(turn, rotations[k, root], precision="highest"))
-        codes.append(rotation.to_6d(local[kept]).reshape(-1))
-        _, position = skinning.forward_kinematics(local, joints, parents)
-        positions.append((position[kept[1:]] - position[root][None]).reshape(-1))
-    return jnp.concatenate([velocity.reshape(-1), *codes, *positions])
+    local = rotations.at[:, root].set(jnp.matmul(turn[None], rotations[:, root], precision="highest"))
+    codes = rotation.to_6d(local[:, kept])
+    _, positions = jax.vmap(lambda turns: skinning.forward_kinematics(turns, joints, parents))(local)
+    relative = positions[:, kept[1:]] - positions[:, None, root]
+    return jnp.concatenate([velocity.reshape(-1), codes.reshape(-1), relative.reshape(-1)])
 
 
 def constant_inputs(betas: Array, material: Material, config: MaterialConfig) -> Array:

@@ -27,17 +27,19 @@ def forward_kinematics(rotations: Array, joints: Array, parents: np.ndarray) -> 
         joints: [J, 3] m canonical joint positions.
         parents: [J] static integers, root -1, each before its children.
     """
-    world_rotation, world_position = [], []
-    for j, parent in enumerate(np.asarray(parents)):
-        if parent < 0:
-            world_rotation.append(rotations[j])
-            world_position.append(joints[j])
-        else:
-            turn = world_rotation[parent]
-            world_rotation.append(jnp.matmul(turn, rotations[j], precision=HIGHEST))
-            offset = jnp.matmul(turn, joints[j] - joints[parent], precision=HIGHEST)
-            world_position.append(world_position[parent] + offset)
-    return jnp.stack(world_rotation), jnp.stack(world_position)
+    # Pointer jumping: a joint's transform to its ancestor's frame, then to that one's ancestor's, twice as far each
+    # time, so that the tree takes the logarithm of its depth in steps, all joints at once.
+    ancestor = np.asarray(parents)
+    turn = rotations
+    position = joints - jnp.where(ancestor[:, None] < 0, 0.0, joints[ancestor])
+    while (ancestor >= 0).any():
+        reached = (ancestor < 0)[:, None]
+        moved = position[ancestor] + jnp.einsum("jab,jb->ja", turn[ancestor], position, precision=HIGHEST)
+        turned = jnp.matmul(turn[ancestor], turn, precision=HIGHEST)
+        position = jnp.where(reached, position, moved)
+        turn = jnp.where(reached[:, :, None], turn, turned)
+        ancestor = np.where(ancestor < 0, -1, ancestor[ancestor])
+    return turn, position
 
 
 def joint_transforms(rotations: Array, joints: Array, parents: np.ndarray) -> Array:

@@ -10,11 +10,12 @@ import optax
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, losses, rollout
+from clothjax import compact_latent, fit, losses, rollout
 from clothjax.clips import Clips
 from clothjax.config import Config, Range
 from clothjax.experiment import material as configured_material
 from clothjax.features import Features
+from clothjax.fit import Weights
 from clothjax.scene import Scene, laplacian_basis
 from clothjax.types import Array, ClothState, Contact, Material
 
@@ -81,8 +82,7 @@ def optimizer(config: Config) -> optax.GradientTransformation:
         )
 
     return optax.chain(
-        optax.clip_by_global_norm(stage.clip),
-        optax.scale_by_adam(b2=stage.adam_b2),
+        optax.flatten(optax.chain(optax.clip_by_global_norm(stage.clip), optax.scale_by_adam(b2=stage.adam_b2))),
         optax.stateless(lambda updates, _: slower(updates)),
         optax.scale_by_learning_rate(schedule),
     )
@@ -111,7 +111,7 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
     basis = laplacian_basis(scene, config.model.blendshapes, stiffness, config.material.density, 1.0 / config.fps)
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
     example = example_features(scene, clips, config)
-    params = compact_latent.init(model_key, scene, example, 0.1 * basis, config.model)
+    params = jax.jit(lambda k: compact_latent.init(k, scene, example, 0.1 * basis, config.model))(model_key)
     if config.model.latent_update == "descent":
         params["descent"]["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(
             params["garment"]
@@ -234,12 +234,9 @@ def make_update(
         (loss, (each, (cloth, terms, seen))), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
             state.params, state.statistics, simulations, state.step, clips
         )
-        norm = optax.tree.norm(gradient)
-        good = jnp.isfinite(norm) & jnp.isfinite(loss)
-        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
-        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
-            updates, optimizer_state = transform.update(gradient, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
+        weights, metrics = fit.descend(
+            transform, Weights(state.params, state.average, state.optimizer), loss, gradient, stage.ema
+        )
         # a blown-up simulation starts anew at its next turn; so does one whose update was skipped
         lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0) | ~jnp.isfinite(each)
         advance = jnp.where(simulations.fresh, frames - 1, frames)
@@ -247,21 +244,21 @@ def make_update(
         cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
         following = Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
 
-        def only_if_good(new, old):
-            return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
-
-        statistics = compact_latent.observe(state.statistics, seen, config.model.normalizer_steps)
-        average = jax.tree.map(lambda a, p: stage.ema * a + (1 - stage.ema) * p, state.average, params)
+        statistics = jax.lax.cond(
+            metrics["nonfinite"],
+            lambda statistics, _: statistics,
+            lambda statistics, seen: compact_latent.observe(statistics, seen, config.model.normalizer_steps),
+            state.statistics,
+            seen,
+        )
         new = TrainingState(
             step=state.step + 1,
             key=state.key,
-            params=only_if_good(params, state.params),
-            average=only_if_good(average, state.average),
-            optimizer=only_if_good(optimizer_state, state.optimizer),
-            statistics=only_if_good(statistics, state.statistics),
+            **weights._asdict(),
+            statistics=statistics,
             pool=jax.tree.map(lambda pool, value: pool.at[chosen].set(value), state.pool, following),
         )
-        metrics = {"loss": loss, "gradient_norm": norm, "nonfinite": ~good, "lost": jnp.sum(lost)}
+        metrics["lost"] = jnp.sum(lost)
         metrics |= {name: jnp.mean(terms[name]) for name in losses.TERMS}
         return new, metrics
 

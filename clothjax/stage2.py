@@ -12,9 +12,10 @@ import optax
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import garment_model, latent_predictor, rollout, stage1
+from clothjax import fit, garment_model, latent_predictor, rollout, stage1
 from clothjax.clips import Clips
 from clothjax.config import Config, ModelConfig
+from clothjax.fit import Weights
 from clothjax.latent_predictor import Normalizers
 from clothjax.scene import Scene
 from clothjax.types import Array, Pose
@@ -202,18 +203,10 @@ def make_update(
     def one(teacher: Teacher, state: TrainingState, _):
         key = jax.random.fold_in(state.key, state.step)
         value, gradient = jax.value_and_grad(loss)(state.params, state, teacher, key)
-        norm = optax.tree.norm(gradient)
-        good = jnp.isfinite(norm) & jnp.isfinite(value)
-        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
-        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
-            updates, optimizer_state = transform.update(gradient, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
-        average = jax.tree.map(lambda a, p: 0.99 * a + 0.01 * p, state.average, params)
-        new = (params, average, optimizer_state)
-        old = (state.params, state.average, state.optimizer)
-        params, average, optimizer_state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
-        new = state._replace(step=state.step + 1, params=params, average=average, optimizer=optimizer_state)
-        return new, {"loss": value, "gradient_norm": norm, "nonfinite": ~good}
+        weights, metrics = fit.descend(
+            transform, Weights(state.params, state.average, state.optimizer), value, gradient, ema=0.99
+        )
+        return state._replace(step=state.step + 1, **weights._asdict()), metrics
 
     @partial(jax.jit, donate_argnums=0)
     def update(state, teacher):
