@@ -15,7 +15,7 @@ quickstart: $(INSTALLED)  ## train both stages on the embedded body, evaluate, r
 	@$(PYTHON) -m experiments.quickstart
 
 test: $(INSTALLED)  ## the tests of every day
-	@$(PYTHON) -m pytest -m "not slow" -n 2
+	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile
 
 test-slow: $(INSTALLED)  ## the long ones
 	@$(PYTHON) -m pytest -m slow

@@ -83,7 +83,11 @@ def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig)
 def window(scene: Scene, character: Character, poses: Pose, config: PhysicsConfig) -> Window:
     """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
     frames = jax.vmap(lambda pose: frame(scene, character, pose, config))(poses)
-    return Window(*(jax.tree.map(lambda x: x[i], frames) for i in range(3)))
+
+    def at(index: int) -> Frame:
+        return jax.tree.map(lambda x: x[index], frames)
+
+    return Window(at(0), at(1), at(2))
 
 
 def skinned(character: Character, frame: Frame) -> Array:

@@ -234,6 +234,8 @@ class EvaluationConfig:
     """Frames of the reference solver's own closed loop, for jitter and pictures."""
     long_frames: int = 1000
     """Frames of the closed-loop test, the motion repeated."""
+    animation_frames: int = 120
+    """Frames of animations, at the most."""
 
 
 @dataclass(frozen=True)

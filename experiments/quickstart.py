@@ -48,9 +48,9 @@ def main(argv: list[str]) -> None:
     part = Motion(clip.rotations[:ONNX_FRAMES], (clip.translation[:ONNX_FRAMES] - origin).astype(np.float32), clip.fps)
     onnx = to_onnx(model, directory / "tshirt.onnx", Pose(part.rotations[0], part.translation[0]))
     onnx_error = check_onnx(onnx, model, part)
-    glb_error = render.write_glb(directory, whole, motion, directory / "tshirt.glb", 120)
+    glb_error = render.write_glb(directory, whole, motion, directory / "tshirt.glb", config.evaluation.animation_frames)
     render.write_comparison(directory, whole, motion, directory / "comparison.png")
-    render.write_webp(directory, whole, motion, directory / "walk.webp", 120)
+    render.write_webp(directory, whole, motion, directory / "walk.webp", config.evaluation.animation_frames)
 
     report = {
         "quickstart": {

@@ -34,14 +34,15 @@ def main(argv: list[str]) -> None:
     parser.add_argument("run", type=Path, help="folder of a finished run")
     parser.add_argument("--motion", default=None, help="asset name or path; default: the configured one")
     parser.add_argument("--out", type=Path, required=True, help="a .webp, .glb or .png")
-    parser.add_argument("--frames", type=int, default=120, help="at the most, of an animation")
+    parser.add_argument("--frames", type=int, default=None, help="at the most; default: the configured number")
     arguments = parser.parse_args(argv)
     writers = {".webp": write_webp, ".glb": write_glb, ".png": write_comparison}
     if arguments.out.suffix not in writers:
         raise ValueError(f"{arguments.out}: cannot write {arguments.out.suffix!r}; allowed: {', '.join(writers)}")
     whole, _ = load_phi(arguments.run)
     motion = arguments.motion or whole.config.evaluation.motions[0]
-    writers[arguments.out.suffix](arguments.run, whole, motion, arguments.out, arguments.frames)
+    frames = arguments.frames or whole.config.evaluation.animation_frames
+    writers[arguments.out.suffix](arguments.run, whole, motion, arguments.out, frames)
     print(f"written to {arguments.out}")
 
 

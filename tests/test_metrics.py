@@ -106,7 +106,7 @@ def test_pinned_vertices_follow_skinning():
     config = dataclasses.replace(small(), garment="skirt_1000", motions=("walk_0",))
     whole = experiment.assemble(config)
     reel, _ = experiment.training_clips(whole)
-    state, _ = stage1.make_update(whole.scene, reel, config, 1, 5)(stage1.init(whole.scene, reel, config))
+    state = stage1.init(whole.scene, reel, config)
     character = characters.dress(whole.scene, jnp.zeros(10), experiment.material(config), config.physics)
     poses = jax.tree.map(lambda x: x[:6], evaluate.windows(experiment.motion(whole, "walk_3")))
     model = {"params": state.params, "statistics": state.statistics}
