@@ -124,9 +124,10 @@ def comparison(path: str | Path, rows: dict[str, Sequence[np.ndarray]], columns:
     """A labelled grid of pictures of one size as a PNG: one row a method, one column a moment."""
     image, draw, font = _pillow("Image", "ImageDraw", "ImageFont")
     height, width = next(iter(rows.values()))[0].shape[:2]
-    left, top = 150, 40
+    letters = font.load_default(20)
+    left, top = 24 + round(max(letters.getlength(label) for label in rows)), 40
     sheet = image.new("RGB", (left + width * len(columns), top + height * len(rows)), "white")
-    pen, letters = draw.Draw(sheet), font.load_default(20)
+    pen = draw.Draw(sheet)
     for c, label in enumerate(columns):
         pen.text((left + width * (c + 0.5), top / 2), label, fill="black", font=letters, anchor="mm")
     for r, (label, pictures) in enumerate(rows.items()):

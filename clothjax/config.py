@@ -178,6 +178,8 @@ class Stage1Config:
     """... and at the most."""
     rollout_every: int = 5000
     """Steps after which the rollout grows by one frame."""
+    gradient_frames: int = 1
+    """Frames of a rollout that gradients go through: 1 is HOOD's way, every frame's input state a constant."""
     start_timestep: float = 1.0 / 3.0  # s, of the quasi-static first step (HOOD); 0: start as skinned
     learning_rate: float = 1e-3
     decay_start: float = 0.4
@@ -192,6 +194,9 @@ class Stage1Config:
     """Decay per step of the averaged parameters that evaluation uses."""
     betas: float = 2.0  # standard deviations, drawn uniformly from +-this
     seed: int = 0
+
+    def __post_init__(self):
+        _require(self.gradient_frames >= 1, f"gradient_frames must be >= 1, got {self.gradient_frames}")
 
 
 @dataclass(frozen=True)
@@ -212,9 +217,9 @@ class Stage2Config:
     hidden: tuple[int, ...] = (512, 512)
     learning_rate: float = 1e-3
     clip: float = 1.0
-    sequences: int = 128
+    sequences: int = 96
     """Teacher rollouts, each of its own betas and material ..."""
-    frames: int = 120
+    frames: int = 160
     """... and this many frames."""
     excluded_joints: tuple[str, ...] = ("Hand", "Finger", "Thumb", "Toe")
     """Joints whose names contain one of these are not inputs."""

@@ -115,12 +115,13 @@ def training_rollout(
     """Mean loss over `frames` frames of Phi from a state, with the last state, mean energies in J, and all features.
 
     A `fresh` state takes the quasi-static step first: the body stands, the step is long, and what it started with as
-    velocity is given back after it. Between frames gradients stop, as in HOOD.
+    velocity is given back after it. Gradients reach back over `config.stage1.gradient_frames` frames.
     """
 
-    def body(carry, _):
+    def body(carry, index):
         state, frame, fresh = carry
-        state = jax.lax.stop_gradient(state)
+        cut = index % config.stage1.gradient_frames == 0
+        state = jax.tree.map(lambda x: jnp.where(cut, jax.lax.stop_gradient(x), x), state)
         poses = motion.poses(clips, frame)
         still = motion.standing(poses)
         chosen = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), still, poses)
@@ -141,7 +142,7 @@ def training_rollout(
         frame = jnp.where(fresh, frame, frame + 1)
         return (taken, frame, jnp.zeros_like(fresh)), (loss, terms, seen)
 
-    (state, frame, fresh), (loss, terms, seen) = jax.lax.scan(body, (state, frame, fresh), None, length=frames)
+    (state, frame, fresh), (loss, terms, seen) = jax.lax.scan(body, (state, frame, fresh), jnp.arange(frames))
     terms = {name: jnp.mean(value) for name, value in terms.items()}
     return jnp.mean(loss), (jax.lax.stop_gradient(state), terms, jax.lax.stop_gradient(seen))
 

@@ -115,6 +115,34 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     assert set(terms) == set(losses.TERMS)
 
 
+def test_gradients_go_through_as_many_frames_as_configured(toy):
+    whole, reel = toy
+    config, scene = whole.config, whole.scene
+    state = stage1.init(scene, reel, config)
+    reel = jax.tree.map(jnp.asarray, reel)
+    one = jax.tree.map(lambda x: x[0], state.pool)
+    character = characters.dress(scene, one.betas, one.material, config.physics)
+
+    def gradient(frames):
+        stage = dataclasses.replace(config.stage1, gradient_frames=frames)
+
+        def loss(params):
+            return rollout.training_rollout(
+                params, state.statistics, scene, character, one.cloth, reel, one.frame, jnp.asarray(False),
+                state.step, 2, dataclasses.replace(config, stage1=stage),
+            )[0]  # fmt: skip
+
+        value, gradients = jax.jit(jax.value_and_grad(loss))(state.params)
+        return float(value), np.asarray(gradients["garment"]["blendshapes"])
+
+    (cut, short), (through, long) = gradient(1), gradient(2)
+    assert cut == pytest.approx(through, rel=1e-5)
+    # the first frame moves the second a little: a thousandth here, hundreds of times what rounding does
+    assert np.linalg.norm(long - short) > 1e-4 * np.linalg.norm(short)
+    _, longer = gradient(3)  # than the rollout
+    assert np.linalg.norm(longer - long) < 1e-5 * np.linalg.norm(long)
+
+
 def test_the_rollout_grows_with_the_curriculum():
     config = Config(stage1=dataclasses.replace(Config().stage1, rollout=1, rollout_end=5, rollout_every=5000))
     assert [stage1.rollout_length(step, config) for step in (0, 4999, 5000, 20000, 10**6)] == [1, 1, 2, 5, 5]
