@@ -68,13 +68,12 @@ def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig)
         skinning.pose_corrected(scene.body, character.body, pose),
     )
     normals = skinning.vertex_normals(body, scene.body.faces)
-    vertices_collide = config.contact_surface == "vertices"
     root = int(np.flatnonzero(np.asarray(scene.body.parents) < 0)[0])
     return Frame(
         garment=skinning.blend(scene.garment.weights, transforms),
         body=body,
         normals=normals,
-        surface=(body, normals) if vertices_collide else contact.surface(body, scene.body.faces, "faces"),
+        surface=contact.centroids(body, scene.body.faces) if config.contact_surface == "centroids" else (body, normals),
         root=character.joints[root] + pose.translation,
         heading=rotation.heading(pose.rotations[root]),
     )

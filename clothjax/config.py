@@ -51,8 +51,9 @@ class PhysicsConfig:
     """Bending is measured from flat, as in HOOD; false: from the canonical angle."""
     shaped_rest: bool = True
     """The rest shape follows the wearer's betas (a graded garment); false: always the template, as in HOOD."""
-    contact_surface: Literal["vertices", "faces"] = "vertices"
-    """The body's tangent planes: at its nearest vertex, or at its nearest face centroid, as in HOOD."""
+    contact_surface: Literal["triangles", "vertices", "centroids"] = "vertices"
+    """What a garment vertex can touch: the body's nearest triangle, exactly; or the tangent plane at its nearest
+    vertex, found in half the time; or that at its nearest face centroid, as in HOOD."""
     reach: float = 0.35  # m, body farther than this from the garment at rest is never searched
 
 

@@ -37,10 +37,13 @@ def start(character: Character, window: Window, latent_size: int) -> ClothState:
 
 
 def time_step(
-    character: Character, state: ClothState, window: Window, timestep: Array, config: Config
+    scene: Scene, character: Character, state: ClothState, window: Window, timestep: Array, config: Config
 ) -> tuple[TimeStep, contact.Contact]:
     """The incremental potential's constants for the step from `window.current` to `window.following`."""
-    planes = contact.find(state.position, window.current.surface, window.following.surface)
+    if config.physics.contact_surface == "triangles":
+        planes = contact.find_on_triangles(state.position, window.current.body, window.following.body, scene.patches)
+    else:
+        planes = contact.find(state.position, window.current.surface, window.following.surface)
     step = TimeStep(
         position=state.position,
         velocity=state.velocity,
@@ -64,9 +67,9 @@ def take(
     config: Config,
 ) -> tuple[ClothState, Taken]:
     """One frame of Phi; `model` holds `params` and `statistics`. The state returned is still at the current root."""
-    step, planes = time_step(character, state, window, timestep, config)
+    step, planes = time_step(scene, character, state, window, timestep, config)
     nearest = planes.index
-    if config.physics.contact_surface == "faces":
+    if config.physics.contact_surface == "centroids":
         nearest = contact.nearest(state.position, window.current.body)
 
     def potential(new):

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from clothjax import graph_sampling, topology
 from clothjax.config import Config
+from clothjax.contact import Patches, patches
 from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
 
 NEAR = 0.05  # m, body beside the garment
@@ -30,6 +31,7 @@ class Scene(NamedTuple):
     graph: dict[str, EdgeSet]  # `mesh`, and the coarse levels in use
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]
+    patches: Patches  # of the body
 
 
 def build(garment: Garment, body: Body, config: Config) -> Scene:
@@ -52,13 +54,15 @@ def build(garment: Garment, body: Body, config: Config) -> Scene:
         strides=[level.stride for level in config.model.convolution],
         radii=[level.radius for level in config.model.convolution],
     )
+    within = reachable(body, garment, config.physics.reach)
     return Scene(
         garment=garment,
-        body=reachable(body, garment, config.physics.reach),
+        body=within,
         mesh=topology.mesh(faces, len(garment.vertices)),
         graph=graph,
         level=graph_sampling.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
+        patches=patches(within.vertices, within.faces),
     )
 
 

@@ -166,7 +166,7 @@ def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
         simulation = begin(key, scene, clips, config)
         character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
         window = characters.window(scene, character, motion.poses(clips, simulation.frame), config.physics)
-        _, planes = rollout.time_step(character, simulation.cloth, window, 1.0 / config.fps, config)
+        _, planes = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
         return compact_latent.feature.features(
             scene, character, simulation.cloth, window, planes, planes.index, jnp.float32(1.0 / config.fps),
             simulation.cloth.position, simulation.cloth.position,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from clothjax import contact, topology
+from clothjax import contact, skinning, topology
 
 
 def icosphere(rounds=2, radius=1.0):
@@ -53,9 +53,16 @@ def test_nearest_takes_the_first_of_equals():
     np.testing.assert_array_equal(contact.nearest(positions, points), [0, 1, 0])
 
 
-def test_surface_of_faces_is_their_centroids():
+def surface(vertices, faces, kind):
+    """Points and normals as the scene makes them."""
+    if kind == "centroids":
+        return contact.centroids(vertices, faces)
+    return vertices, skinning.vertex_normals(vertices, faces)
+
+
+def test_centroids_of_faces():
     vertices, faces = icosphere()
-    points, normals = contact.surface(vertices.astype(np.float32), faces, "faces")
+    points, normals = contact.centroids(vertices.astype(np.float32), faces)
     for face, point, normal in zip(faces[::17], points[::17], normals[::17]):
         a, b, c = vertices[face]
         np.testing.assert_allclose(point, (a + b + c) / 3, atol=1e-6)
@@ -65,15 +72,15 @@ def test_surface_of_faces_is_their_centroids():
 
 def test_surface_of_a_face_without_area_is_finite():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], np.float32)
-    for kind in ("vertices", "faces"):
-        points, normals = contact.surface(vertices, np.array([[0, 1, 2]]), kind)
+    for kind in ("vertices", "centroids"):
+        points, normals = surface(vertices, np.array([[0, 1, 2]]), kind)
         assert np.isfinite(points).all() and (np.asarray(normals) == 0).all()
 
 
-@pytest.mark.parametrize("kind", ["vertices", "faces"])
+@pytest.mark.parametrize("kind", ["vertices", "centroids"])
 def test_distance_to_a_sphere(kind):
     vertices, faces = icosphere(rounds=3, radius=0.5)
-    body = contact.surface(vertices.astype(np.float32), faces, kind)
+    body = surface(vertices.astype(np.float32), faces, kind)
     random = np.random.default_rng(1)
     direction = random.standard_normal((500, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -88,9 +95,9 @@ def test_distance_to_a_sphere(kind):
 
 def test_the_plane_is_chosen_now_and_kept_for_the_step():
     vertices, faces = icosphere()
-    now = contact.surface(vertices.astype(np.float32), faces, "vertices")
+    now = surface(vertices.astype(np.float32), faces, "vertices")
     turned = vertices[:, [1, 2, 0]]  # a rotation: every vertex goes far from where it was
-    following = contact.surface(turned.astype(np.float32), faces, "vertices")
+    following = surface(turned.astype(np.float32), faces, "vertices")
     positions = np.float32(1.1) * vertices.astype(np.float32)
     found = jax.jit(contact.find)(positions, now, following)
     np.testing.assert_array_equal(found.index, np.arange(len(vertices)))
@@ -103,8 +110,8 @@ def test_contact_moves_with_the_scene():
     vertices, faces = icosphere(rounds=1)
     shift = np.array([[2.0, -1.0, 0.5]], np.float32)
     positions = np.random.default_rng(2).uniform(-1, 1, (50, 3)).astype(np.float32)
-    here = contact.surface(vertices.astype(np.float32), faces, "vertices")
-    there = contact.surface(vertices.astype(np.float32) + shift, faces, "vertices")
+    here = surface(vertices.astype(np.float32), faces, "vertices")
+    there = surface(vertices.astype(np.float32) + shift, faces, "vertices")
     before, after = contact.find(positions, here, here), contact.find(positions + shift, there, there)
     np.testing.assert_array_equal(after.index, before.index)
     np.testing.assert_allclose(

@@ -68,7 +68,7 @@ def test_hood_energies(hood, roll, x64):
     now, velocity = hood["cloth"][roll].copy(), hood["velocity"][roll].copy()
     now[hood["pinned"]], velocity[hood["pinned"]] = hood["cloth_target"][roll], 0.0
     new = hood["predicted"][roll]
-    body, following = (contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body", "body_next"))
+    body, following = (contact.centroids(hood[name][roll], hood["body_faces"]) for name in ("body", "body_next"))
     touched = contact.find(now, body, following)
     values = {
         "stretching_energy": physics.stretching(new[mesh.faces], rest.inverse, rest.face_area, MU, LAM),
@@ -91,9 +91,7 @@ def test_hood_friction_with_its_traps(hood, x64):
     roll = 2
     now, new = hood["cloth"][roll].copy(), hood["predicted"][roll]
     now[hood["pinned"]] = hood["cloth_target"][roll]
-    before, after = (
-        contact.surface(hood[name][roll], hood["body_faces"], "faces") for name in ("body_previous", "body")
-    )
+    before, after = (contact.centroids(hood[name][roll], hood["body_faces"]) for name in ("body_previous", "body"))
     p, q = contact.nearest(now, before[0]), contact.nearest(new, after[0])
     near = (np.sum((now - before[0][p]) ** 2, axis=1) < 3e-3) & (np.sum((new - after[0][q]) ** 2, axis=1) < 3e-3)
     slip = new - (now + after[0][p] - before[0][p])
