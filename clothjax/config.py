@@ -213,6 +213,8 @@ class Stage2Config:
     vertex_share: float = 0.8
     """Of the loss, taken by the error of the decoded vertices; the rest is that of the code (21). Both are shares of a
     variance, so that parts of the code that move nothing do not crowd out those that do."""
+    latent_decay: float = 0.1
+    """Part of Z forgotten in a frame unless the network gives it back: without it, the closed loop drifts."""
     pushforward: bool = False
     """Only the last frame of the rollout is trained, the others without gradient."""
     hidden: tuple[int, ...] = (512, 512)

@@ -131,6 +131,7 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
         state.latent,
         latent_predictor.normalise(model.normalizers.pose, inputs, bound=latent_predictor.POSE_BOUND),
         model.constants,
+        model.config.stage2.latent_decay,
     )
     code = latent_predictor.denormalise(model.normalizers.latent, latent)
     free = 1.0 - model.garment.pinned.astype(code.dtype)

@@ -63,9 +63,12 @@ def init(key: Array, latent: int, pose: int, constants: int, config: Stage2Confi
     return init_mlp(key, sizes, norm=False, last_gain=0.01)
 
 
-def predict(params: Params, latent: Array, pose: Array, constants: Array) -> Array:
-    """The next latent code [L] in standard deviations, from the current one and normalised inputs."""
-    return latent + mlp(params, jnp.concatenate([latent, pose, constants]))
+def predict(params: Params, latent: Array, pose: Array, constants: Array, decay: float) -> Array:
+    """The next latent code [L] in standard deviations, from the current one and normalised inputs.
+
+    A part `decay` of the code is forgotten unless the network gives it back, so that no direction of the code drifts.
+    """
+    return (1.0 - decay) * latent + mlp(params, jnp.concatenate([latent, pose, constants]))
 
 
 def normalise(statistics: Statistics, row: Array, bound: float = jnp.inf) -> Array:

@@ -168,7 +168,7 @@ def rollout_loss(
         pose, target = inputs
         if stage.pushforward:
             latent = jax.lax.stop_gradient(latent)
-        predicted = latent_predictor.predict(params, latent, pose, constants)
+        predicted = latent_predictor.predict(params, latent, pose, constants, stage.latent_decay)
         error = jnp.mean((predicted - target) ** 2)
         if stage.vertex_share > 0:
             apart = weights(predicted) - weights(target)

@@ -88,7 +88,7 @@ def test_a_share_of_the_loss_is_the_vertex_error_over_the_vertices_variance(shar
     )
     normal = [latent_predictor.normalise(state.normalizers.latent, z) for z in codes]
     pose = latent_predictor.normalise(state.normalizers.pose, jnp.asarray(teacher.poses[0, 0]))
-    predicted = latent_predictor.predict(state.params, normal[0], pose, jnp.zeros(3))
+    predicted = latent_predictor.predict(state.params, normal[0], pose, jnp.zeros(3), 0.1)
     every = decode(jnp.asarray(teacher.latents[:, 1:].reshape(-1, 6)))
     pair = decode(jnp.stack([latent_predictor.denormalise(state.normalizers.latent, predicted), codes[1]]))
     vertex = jnp.mean((pair[0] - pair[1]) ** 2) / jnp.mean((every - every.mean(0, keepdims=True)) ** 2)
@@ -106,7 +106,7 @@ def test_trained_with_noise_it_follows_its_teacher_in_closed_loop():
 
     def follow(latent, pose):
         latent = latent_predictor.predict(
-            state.params, latent, latent_predictor.normalise(normalizers.pose, pose), jnp.zeros(3)
+            state.params, latent, latent_predictor.normalise(normalizers.pose, pose), jnp.zeros(3), 0.1
         )
         return latent, latent_predictor.denormalise(normalizers.latent, latent)
 
