@@ -96,13 +96,18 @@ def test_phi_does_not_see_place_or_heading(toy, update):
     np.testing.assert_allclose(heading - root, (plain - root) @ turn.T, atol=2e-4)
 
 
+def _untrained(whole, reel):
+    """A first training state, one of its simulations and who is in it."""
+    state = stage1.init(whole.scene, reel, whole.config)
+    one = jax.tree.map(lambda x: x[0], state.pool)
+    return state, one, characters.dress(whole.scene, one.betas, one.material, whole.config.physics)
+
+
 def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     whole, reel = toy
     config, scene = whole.config, whole.scene
-    state = stage1.init(scene, reel, config)
+    state, one, character = _untrained(whole, reel)
     reel = jax.tree.map(jnp.asarray, reel)
-    one = jax.tree.map(lambda x: x[0], state.pool)
-    character = characters.dress(scene, one.betas, one.material, config.physics)
     _, (cloth, terms, _) = rollout.training_rollout(
         state.params, state.statistics, scene, character, one.cloth, reel, one.frame, jnp.asarray(True),
         state.step, 1, config,
@@ -118,10 +123,8 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
 def test_gradients_go_through_as_many_frames_as_configured(toy):
     whole, reel = toy
     config, scene = whole.config, whole.scene
-    state = stage1.init(scene, reel, config)
+    state, one, character = _untrained(whole, reel)
     reel = jax.tree.map(jnp.asarray, reel)
-    one = jax.tree.map(lambda x: x[0], state.pool)
-    character = characters.dress(scene, one.betas, one.material, config.physics)
 
     def gradient(frames):
         stage = dataclasses.replace(config.stage1, gradient_frames=frames)
