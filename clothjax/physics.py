@@ -14,7 +14,6 @@ from clothjax.types import Array, Mesh, Rest
 GRAVITY = 9.81  # m/s^2
 THICKNESS = 4.7e-4  # m, of the StVK membrane, HOOD and SNUG
 COLLISION_OFFSET = 3e-3  # m, the cloth is pushed out to this distance from the body
-FRICTION_RADIUS = 3e-3  # m, closer than this to the body a vertex is in contact
 
 
 def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:

@@ -96,6 +96,14 @@ def test_a_share_of_the_loss_is_the_vertex_error_over_the_vertices_variance(shar
     np.testing.assert_allclose(value, expected, rtol=1e-4)
 
 
+def test_a_code_that_the_network_does_not_hold_is_forgotten():
+    params = latent_predictor.init(jax.random.key(0), 6, 4, 3, _config(hidden=(8,)).stage2)
+    silent = jax.tree.map(jnp.zeros_like, params)
+    code = jnp.arange(6.0)
+    kept = latent_predictor.predict(silent, code, jnp.ones(4), jnp.ones(3), 0.1)
+    np.testing.assert_allclose(kept, 0.9 * code, rtol=1e-6)
+
+
 def test_trained_with_noise_it_follows_its_teacher_in_closed_loop():
     teacher = _rotating_teacher()
     config = _config(steps=600, hidden=(48,), batch=32, rollout=4, learning_rate=3e-3)
