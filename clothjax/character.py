@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import contact, physics, rotation, skinning
+from clothjax import physics, rotation, skinning
 from clothjax.config import PhysicsConfig
 from clothjax.scene import Scene
 from clothjax.types import Array, Material, Pose, Rest
@@ -30,7 +30,6 @@ class Frame(NamedTuple):
     garment: Array  # [V, 3, 4] skinning transforms of the garment's vertices
     body: Array  # [B, 3] m
     normals: Array  # [B, 3]
-    surface: tuple[Array, Array]  # points [P, 3] m and normals [P, 3] that collide
     root: Array  # [3] m, the root joint
     heading: Array  # [3, 3] of the root, about +Y
 
@@ -59,7 +58,7 @@ def dress(scene: Scene, betas: Array, material: Material, config: PhysicsConfig)
     )
 
 
-def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig) -> Frame:
+def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
     """The character at a pose whose translation [3] m is relative to the root's at the current frame."""
     transforms = skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents)
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
@@ -73,15 +72,14 @@ def frame(scene: Scene, character: Character, pose: Pose, config: PhysicsConfig)
         garment=skinning.blend(scene.garment.weights, transforms),
         body=body,
         normals=normals,
-        surface=contact.centroids(body, scene.body.faces) if config.contact_surface == "centroids" else (body, normals),
         root=character.joints[root] + pose.translation,
         heading=rotation.heading(pose.rotations[root]),
     )
 
 
-def window(scene: Scene, character: Character, poses: Pose, config: PhysicsConfig) -> Window:
+def window(scene: Scene, character: Character, poses: Pose) -> Window:
     """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
-    frames = jax.vmap(lambda pose: frame(scene, character, pose, config))(poses)
+    frames = jax.vmap(lambda pose: frame(scene, character, pose))(poses)
 
     def at(index: int) -> Frame:
         return jax.tree.map(lambda x: x[index], frames)

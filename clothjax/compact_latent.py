@@ -174,7 +174,6 @@ def step(
     state: ClothState,
     window: Window,
     contact: Contact,
-    nearest_vertex: Array,
     timestep: Array,
     potential: Callable[[Array], Array],
     model: ModelConfig,
@@ -197,9 +196,7 @@ def step(
         held = skinning.apply(window.following.garment, displaced)
     force = -jax.grad(potential)(held)
     code_force = jax.lax.stop_gradient(pullback(force)[0] if descent else jnp.zeros_like(state.latent))
-    seen = feature.features(
-        scene, character, state, window, contact, nearest_vertex, timestep, held, force, model, material
-    )
+    seen = feature.features(scene, character, state, window, contact, timestep, held, force, model, material)
     seen = jax.lax.stop_gradient(seen)
     code = encode(params, statistics, scene, seen, model)
     cloth = character.material

@@ -51,10 +51,22 @@ class PhysicsConfig:
     """Bending is measured from flat, as in HOOD; false: from the canonical angle."""
     shaped_rest: bool = True
     """The rest shape follows the wearer's betas (a graded garment); false: always the template, as in HOOD."""
-    contact_surface: Literal["triangles", "vertices", "centroids"] = "vertices"
-    """What a garment vertex can touch: the body's nearest triangle, exactly; or the tangent plane at its nearest
-    vertex, found in half the time; or that at its nearest face centroid, as in HOOD."""
+    contact_surface: Literal["triangles", "centroids"] = "triangles"
+    """What a garment vertex can touch: the body's nearest triangle; or the plane of the face whose centroid is
+    nearest, as in HOOD."""
+    edge_contact: bool = True
+    """Edges of the garment touch the body between their ends too, so that a limb does not slip through. Triangles only.
+    """
+    self_contact: bool = False
+    """Vertices of the garment keep away from its triangles."""
+    self_offset: float = 2e-3  # m, the distance that they keep
     reach: float = 0.35  # m, body farther than this from the garment at rest is never searched
+
+    def __post_init__(self):
+        _require(
+            self.contact_surface == "triangles" or not self.edge_contact,
+            "edge_contact needs contact_surface: triangles; set edge_contact: false",
+        )
 
 
 @dataclass(frozen=True)
@@ -86,6 +98,8 @@ class LossConfig:
     inertia: Ramp = Ramp()
     friction: Ramp = Ramp()
     collision: Ramp = Ramp()
+    edge_collision: Ramp = Ramp()
+    self_collision: Ramp = Ramp()
     scale: float = 0.02  # J, the energy that counts as a loss of 1
 
 

@@ -41,7 +41,6 @@ def features(
     state: ClothState,
     window: Window,
     contact: Contact,
-    nearest_vertex: Array,
     timestep: Array,
     held: Array,
     force: Array,
@@ -51,8 +50,7 @@ def features(
     """The inputs of Phi for one step: HOOD's, plus positions and accelerations (method: X_H+).
 
     Args:
-        contact: planes at the garment's nearest body points, for the canonical features.
-        nearest_vertex: [V] int32, the body vertex nearest to each garment vertex now.
+        contact: planes at the body points nearest to the garment now.
         timestep: s.
         held: [V, 3] m, the next positions if the canonical displacement were kept.
         force: [V, 3] N on the garment there, minus the potential's gradient.
@@ -63,7 +61,7 @@ def features(
     inputs = material_inputs(character.material, material)
 
     # body nodes: the distinct nearest vertices, in slots
-    vertices, slots = jnp.unique(nearest_vertex, size=count, fill_value=0, return_inverse=True)
+    vertices, slots = jnp.unique(contact.index, size=count, fill_value=0, return_inverse=True)
     slots = slots.astype(jnp.int32).reshape(-1)
     body_now, body_next = current.body[vertices], following.body[vertices]
     body_before = window.previous.body[vertices]
@@ -101,8 +99,8 @@ def features(
         for name, (senders, receivers) in scene.graph.items()
     }
 
-    offset_now = state.position - current.body[nearest_vertex]
-    offset_next = state.position - following.body[nearest_vertex]
+    offset_now = state.position - current.body[contact.index]
+    offset_next = state.position - following.body[contact.index]
     to_body, to_garment = (
         jnp.concatenate(
             [

@@ -7,9 +7,7 @@ import jax.numpy as jnp
 from clothjax import contact as contacts
 from clothjax import physics
 from clothjax.config import LossConfig, PhysicsConfig, Ramp
-from clothjax.types import Array, Contact, Material, Mesh, Rest
-
-TERMS = ("stretching", "bending", "gravity", "inertia", "friction", "collision")
+from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, SelfContact
 
 
 class TimeStep(NamedTuple):
@@ -23,6 +21,8 @@ class TimeStep(NamedTuple):
     contact: Contact
     touching: Array  # [V] bool, in contact now
     timestep: Array  # s
+    edge_contact: EdgeContact | None = None
+    self_contact: SelfContact | None = None
 
 
 def touching(position: Array, contact: Contact, radius: float) -> Array:
@@ -39,7 +39,7 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
     contact = step.contact
     normal = contact.normal + contact.normal_next
     length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
-    return {
+    terms = {
         "stretching": physics.stretching(
             new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
         ),
@@ -60,6 +60,27 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
         "collision": config.collision_stiffness
         * physics.collision(contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset),
     }
+    if step.edge_contact is not None:
+        terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config)
+    if step.self_contact is not None:
+        points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
+        terms["self_collision"] = self_collision(points, step.self_contact, config)
+    return terms
+
+
+def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig) -> Array:
+    """Collision energy [...] J of edges [..., 2, 3] m at the places that touch."""
+    start, end = ends[..., 0, :], ends[..., 1, :]
+    point = start + contact.place[..., None] * (end - start)
+    distance = contacts.distance(point, contact.point_next, contact.normal_next)
+    return config.collision_stiffness * physics.collision(distance, config.collision_offset)
+
+
+def self_collision(points: Array, contact: SelfContact, config: PhysicsConfig) -> Array:
+    """Collision energy [...] J of vertices and the corners of the triangles they may touch [..., 4, 3] m."""
+    place = jnp.sum(contact.weights[..., :, None] * points[..., 1:, :], axis=-2)
+    distance = contacts.distance(points[..., 0, :], place, contact.normal)
+    return config.collision_stiffness * physics.collision(distance, config.self_offset)
 
 
 def energies(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
@@ -74,9 +95,8 @@ def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> 
 
 def weighted(terms: dict[str, Array], config: LossConfig, training_step: Array) -> Array:
     """The training loss: the weighted sum of terms in J over `config.scale`; absent terms are not computed."""
-    total = sum(
-        weight(getattr(config, name), training_step) * terms[name] for name in TERMS if not getattr(config, name).absent
-    )
+    ramps = {name: getattr(config, name) for name in terms}
+    total = sum(weight(ramp, training_step) * terms[name] for name, ramp in ramps.items() if not ramp.absent)
     return total / config.scale
 
 

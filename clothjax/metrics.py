@@ -45,9 +45,9 @@ def step_measures(
 
     @jax.jit
     def at(before: Array, now: Array, after: Array, poses: Pose):
-        window = characters.window(scene, character, poses, config.physics)
+        window = characters.window(scene, character, poses)
         state = _state(before + poses.translation[0][None], now)
-        step, _ = rollout.time_step(scene, character, state, window, 1.0 / config.fps, config)
+        step = rollout.time_step(scene, character, state, window, 1.0 / config.fps, config)
         new = after + poses.translation[2][None]
         held = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
         skinned = characters.skinned(character, window.following)
@@ -83,20 +83,20 @@ def simulate(scene: Scene, character: Character, poses: Pose, config: Config) ->
 
     @jax.jit
     def begin(poses):
-        window = characters.window(scene, character, poses, config.physics)
+        window = characters.window(scene, character, poses)
         state = rollout.start(character, window, 0)
         still = characters.Window(window.current, window.current, window.current)
         resting = state._replace(velocity=jnp.zeros_like(state.velocity))
-        long, _ = rollout.time_step(
+        long = rollout.time_step(
             scene, character, resting, still, config.stage1.start_timestep or 1 / config.fps, config
         )
         return state, long
 
     @jax.jit
     def constants(before, now, poses):
-        window = characters.window(scene, character, poses, config.physics)
+        window = characters.window(scene, character, poses)
         state = _state(before + poses.translation[0][None], now)
-        step, _ = rollout.time_step(scene, character, state, window, 1.0 / config.fps, config)
+        step = rollout.time_step(scene, character, state, window, 1.0 / config.fps, config)
         transforms = window.following.garment
         held = skinning.apply(transforms, skinning.unapply(window.current.garment, now))
         return step, jnp.where(scene.garment.pinned[:, None], characters.skinned(character, window.following), held)

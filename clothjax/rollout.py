@@ -38,23 +38,31 @@ def start(character: Character, window: Window, latent_size: int) -> ClothState:
 
 def time_step(
     scene: Scene, character: Character, state: ClothState, window: Window, timestep: Array, config: Config
-) -> tuple[TimeStep, contact.Contact]:
+) -> TimeStep:
     """The incremental potential's constants for the step from `window.current` to `window.following`."""
-    if config.physics.contact_surface == "triangles":
-        planes = contact.find_on_triangles(state.position, window.current.body, window.following.body, scene.patches)
+    physics = config.physics
+    body, body_next = window.current.body, window.following.body
+    at_edges = on_self = None
+    if physics.contact_surface == "triangles":
+        planes = contact.find(state.position, body, body_next, scene.patches)
     else:
-        planes = contact.find(state.position, window.current.surface, window.following.surface)
-    step = TimeStep(
+        planes = contact.find_at_centroids(state.position, body, body_next, scene.body.faces)
+    if physics.edge_contact:
+        at_edges = contact.find_at_edges(state.position, planes, scene.mesh, body, body_next, scene.patches)
+    if physics.self_contact:
+        on_self = contact.find_on_self(state.position, scene.garment_patches)
+    return TimeStep(
         position=state.position,
         velocity=state.velocity,
         mass=character.mass,
         rest=character.rest,
         material=character.material,
         contact=planes,
-        touching=losses.touching(state.position, planes, config.physics.friction_radius),
+        touching=losses.touching(state.position, planes, physics.friction_radius),
         timestep=jnp.asarray(timestep, state.position.dtype),
+        edge_contact=at_edges,
+        self_contact=on_self,
     )
-    return step, planes
 
 
 def take(
@@ -67,16 +75,13 @@ def take(
     config: Config,
 ) -> tuple[ClothState, Taken]:
     """One frame of Phi; `model` holds `params` and `statistics`. The state returned is still at the current root."""
-    step, planes = time_step(scene, character, state, window, timestep, config)
-    nearest = planes.index
-    if config.physics.contact_surface == "centroids":
-        nearest = contact.nearest(state.position, window.current.body)
+    step = time_step(scene, character, state, window, timestep, config)
 
     def potential(new):
         return losses.potential(new, step, scene.mesh, config.physics)
 
     new, latent, seen = compact_latent.step(
-        model["params"], model["statistics"], scene, character, state, window, planes, nearest,
+        model["params"], model["statistics"], scene, character, state, window, step.contact,
         step.timestep, potential, config.model, config.material,
     )  # fmt: skip
     velocity = new - state.position
@@ -90,7 +95,7 @@ def follow(state: ClothState, advance: Array) -> ClothState:
 
 def settle(model: dict, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
     """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
-    window = characters.window(scene, character, poses, config.physics)
+    window = characters.window(scene, character, poses)
     size = _latent_size(scene, config)
     state = start(character, window, size)
     if config.stage1.start_timestep == 0:
@@ -128,7 +133,7 @@ def training_rollout(
         poses = motion.poses(clips, frame)
         still = motion.standing(poses)
         chosen = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), still, poses)
-        window = characters.window(scene, character, chosen, config.physics)
+        window = characters.window(scene, character, chosen)
         velocity = jnp.where(fresh, 0.0, state.velocity)
         timestep = jnp.where(fresh, config.stage1.start_timestep, 1.0 / config.fps)
         model = {"params": params, "statistics": statistics}
@@ -164,7 +169,7 @@ def play(model: dict, scene: Scene, character: Character, poses: Pose, config: C
     state = settle(model, scene, character, first, config)
 
     def body(state, poses):
-        window = characters.window(scene, character, poses, config.physics)
+        window = characters.window(scene, character, poses)
         taken, (new, _, _) = take(model, scene, character, state, window, 1.0 / config.fps, config)
         return follow(taken, poses.translation[2]), (new, state, taken.latent)
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from clothjax import graph_sampling, topology
 from clothjax.config import Config
-from clothjax.contact import Patches, patches
+from clothjax.proximity import Patches, patches
 from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
 
 NEAR = 0.05  # m, body beside the garment
@@ -32,6 +32,7 @@ class Scene(NamedTuple):
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]
     patches: Patches  # of the body
+    garment_patches: Patches
 
 
 def build(garment: Garment, body: Body, config: Config) -> Scene:
@@ -63,6 +64,7 @@ def build(garment: Garment, body: Body, config: Config) -> Scene:
         level=graph_sampling.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
         patches=patches(within.vertices, within.faces),
+        garment_patches=patches(garment.vertices, faces),
     )
 
 

@@ -23,12 +23,12 @@ SHORTEST_STEP = 1e-8
 
 
 class Structure(NamedTuple):
-    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and where element blocks go in it."""
+    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and which element blocks each sums."""
 
     indptr: np.ndarray  # [V + 1] int32
     indices: np.ndarray  # [N] int32, column of each block
     diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
-    target: np.ndarray  # [9 F + 16 H + V] int32, the block of each pair of corners of an element
+    gather: scipy.sparse.csr_array  # [N, P] ones, where block n sums the block of a pair of corners of an element
 
 
 class SolverInfo(NamedTuple):
@@ -41,19 +41,33 @@ class SolverInfo(NamedTuple):
     energy: float  # J
 
 
-def structure(mesh: Mesh, vertex_count: int) -> Structure:
-    """The sparsity pattern of the Hessian of a garment with `vertex_count` vertices."""
+def structure(step: TimeStep, mesh: Mesh) -> Structure:
+    """The sparsity pattern of the Hessian of a time step."""
+    count = len(step.mass)
     rows, columns = [], []
-    for corners in (np.asarray(mesh.faces), np.asarray(mesh.hinges), np.arange(vertex_count)[:, None]):
+    for corners in _corners(step, mesh):
         pairs = (*corners.shape, corners.shape[1])
         rows.append(np.broadcast_to(corners[:, :, None], pairs).reshape(-1))
         columns.append(np.broadcast_to(corners[:, None, :], pairs).reshape(-1))
-    key = np.concatenate(rows).astype(np.int64) * vertex_count + np.concatenate(columns)
+    key = np.concatenate(rows).astype(np.int64) * count + np.concatenate(columns)
     blocks, target = np.unique(key, return_inverse=True)
-    row, column = blocks // vertex_count, blocks % vertex_count
-    indptr = np.searchsorted(row, np.arange(vertex_count + 1))
-    diagonal = np.flatnonzero(row == column)
-    return Structure(*(a.astype(np.int32) for a in (indptr, column, diagonal, target.reshape(-1))))
+    row, column = blocks // count, blocks % count
+    gather = scipy.sparse.csr_array(
+        (np.ones(len(key)), (target.reshape(-1), np.arange(len(key)))), shape=(len(blocks), len(key))
+    )
+    indptr = np.searchsorted(row, np.arange(count + 1))
+    return Structure(indptr.astype(np.int32), column.astype(np.int32), np.flatnonzero(row == column), gather)
+
+
+def _corners(step: TimeStep, mesh: Mesh) -> list[np.ndarray]:
+    """Vertices of the elements that the potential is a sum over, kind by kind."""
+    vertices = np.arange(len(step.mass))[:, None]
+    kinds = [np.asarray(mesh.faces), np.asarray(mesh.hinges), vertices]
+    if step.edge_contact is not None:
+        kinds.append(np.asarray(mesh.edges))
+    if step.self_contact is not None:
+        kinds.append(np.concatenate([vertices, step.self_contact.corners], axis=1))
+    return kinds
 
 
 def solve_step(
@@ -63,7 +77,7 @@ def solve_step(
     pinned: Array,
     config: PhysicsConfig,
     *,
-    tolerance: float = 1e-3,
+    tolerance: float = 1e-6,
     max_iterations: int = 500,
 ) -> tuple[np.ndarray, SolverInfo]:
     """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
@@ -76,7 +90,6 @@ def solve_step(
     Args:
         new0: [V, 3] m, where to start; pinned vertices stay there.
         step: the time step; taken to float64.
-        mesh: faces and hinges.
         pinned: [V] bool.
         config: constants of contact and friction.
         tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the
@@ -92,18 +105,19 @@ def solve_step(
     x = np.array(new0, np.float64)
     step = jax.tree.map(_to_float64, step)
     _check(x, step)
-    mesh = Mesh(np.asarray(mesh.faces), np.asarray(mesh.hinges))
-    pattern = structure(mesh, len(x))
+    mesh = jax.tree.map(np.asarray, mesh)
+    pattern = structure(step, mesh)
     free = np.broadcast_to(~np.asarray(pinned, bool)[:, None], x.shape)
     weight = max(float(np.linalg.norm(physics.GRAVITY * step.mass[free[:, 0]])), np.finfo(np.float64).tiny)
 
     with jax.enable_x64(True):
         evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config)
-        hessian = partial(hessians, step=step, mesh=mesh, pattern=pattern, config=config)
         energy, gradient = _host(evaluate(x), free)
         iterations = 0
         while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
-            exact, semidefinite = hessian(x)
+            exact, semidefinite = hessians(x, step, mesh, pattern, config)
+            if not (np.isfinite(exact).all() and np.isfinite(semidefinite).all()):
+                break
             # inexact far away, more exact as the gradient falls: the last iterations converge superlinearly
             forcing = min(0.1, np.sqrt(0.1 * np.linalg.norm(gradient) / weight))
             direction = _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing)
@@ -115,13 +129,23 @@ def solve_step(
     return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy)
 
 
-@partial(jax.jit, static_argnames="config")
-def hessians(x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig) -> tuple[Array, Array]:
+def hessians(
+    x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
 
     The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the
     square of the residual's gradient (Gauss-Newton); of terms of single vertices, the positive eigenvalues.
     """
+    return tuple(
+        (pattern.gather @ np.asarray(blocks).reshape(-1, 9)).reshape(-1, 3, 3)
+        for blocks in _element_hessians(x, step, mesh, config)
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[Array, Array]:
+    """Blocks [P, 3, 3] N/m of all pairs of corners of all elements, in the order of `_corners`: exact, semidefinite."""
     rest, material = step.rest, step.material
     corners, hinges = x[mesh.faces], x[mesh.hinges]
 
@@ -143,17 +167,30 @@ def hessians(x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: P
     values, vectors = jnp.linalg.eigh(vertex)
     positive = jnp.einsum("vab,vb,vcb->vac", vectors, jnp.maximum(values, 0.0), vectors)
 
-    exact = (
+    exact = [
         jax.vmap(jax.hessian(face_energy))(corners, rest.inverse, rest.face_area),
         jax.vmap(jax.hessian(hinge_energy))(hinges, rest.hinge_area, rest.hinge_angle),
-        vertex,
-    )
-    semidefinite = (
+        vertex[:, None, :, None],
+    ]
+    semidefinite = [
         _stretching_semidefinite(corners, step),
         _bending_semidefinite(hinges, step),
-        positive,
-    )
-    return _assemble(exact, pattern), _assemble(semidefinite, pattern)
+        positive[:, None, :, None],
+    ]
+    # the last two are convex
+    convex = []
+    if step.edge_contact is not None:
+        energy = partial(losses.edge_collision, config=config)
+        convex.append(jax.vmap(jax.hessian(energy))(x[mesh.edges], step.edge_contact))
+    if step.self_contact is not None:
+        energy = partial(losses.self_collision, config=config)
+        points = jnp.concatenate([x[:, None], x[step.self_contact.corners]], axis=1)
+        convex.append(jax.vmap(jax.hessian(energy))(points, step.self_contact))
+
+    def pairs(elements: list[Array]) -> Array:
+        return jnp.concatenate([jnp.swapaxes(element, 2, 3).reshape(-1, 3, 3) for element in elements])
+
+    return pairs(exact + convex), pairs(semidefinite + convex)
 
 
 def _stretching_semidefinite(corners: Array, step: TimeStep) -> Array:
@@ -198,14 +235,6 @@ def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
     slope = jax.vmap(jax.grad(residual))(hinges, step.rest.hinge_angle)
     stiffness = step.material.bending / (4.0 * step.rest.hinge_area)
     return jnp.einsum("h,hia,hjb->hiajb", stiffness, slope, slope)
-
-
-def _assemble(elements: tuple[Array, Array, Array], pattern: Structure) -> Array:
-    face, hinge, vertex = elements
-    blocks = [jnp.swapaxes(element, 2, 3).reshape(-1, 3, 3) for element in (face, hinge)]
-    return jax.ops.segment_sum(
-        jnp.concatenate([*blocks, vertex]), pattern.target, num_segments=pattern.indices.shape[0]
-    )
 
 
 @partial(jax.jit, static_argnames="config")

@@ -97,7 +97,7 @@ def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
     material = sample_material(keys[1], config)
     frame = motion.draw(clips, jax.random.uniform(keys[2]))
     character = characters.dress(scene, betas, material, config.physics)
-    window = characters.window(scene, character, motion.poses(clips, frame), config.physics)
+    window = characters.window(scene, character, motion.poses(clips, frame))
     left, channels = compact_latent.latent_size(scene, config.model)
     cloth = rollout.start(character, window, left * channels)
     return Simulation(cloth, betas, material, frame, jnp.asarray(config.stage1.start_timestep > 0))
@@ -165,10 +165,10 @@ def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
     def features(key):
         simulation = begin(key, scene, clips, config)
         character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
-        window = characters.window(scene, character, motion.poses(clips, simulation.frame), config.physics)
-        _, planes = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
+        window = characters.window(scene, character, motion.poses(clips, simulation.frame))
+        step = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
         return compact_latent.feature.features(
-            scene, character, simulation.cloth, window, planes, planes.index, jnp.float32(1.0 / config.fps),
+            scene, character, simulation.cloth, window, step.contact, jnp.float32(1.0 / config.fps),
             simulation.cloth.position, simulation.cloth.position,
             config.model, config.material,
         )  # fmt: skip
@@ -259,7 +259,7 @@ def make_update(
             pool=jax.tree.map(lambda pool, value: pool.at[chosen].set(value), state.pool, following),
         )
         metrics["lost"] = jnp.sum(lost)
-        metrics |= {name: jnp.mean(terms[name]) for name in losses.TERMS}
+        metrics |= {name: jnp.mean(values) for name, values in terms.items()}
         return new, metrics
 
     @partial(jax.jit, donate_argnums=0)

@@ -8,7 +8,7 @@ from clothjax.types import EdgeSet, Mesh
 
 
 def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
-    """Faces and hinges of a triangle mesh.
+    """Faces, hinges and edges of a triangle mesh.
 
     Args:
         faces: [F, 3] vertex indices.
@@ -29,7 +29,7 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
     same_as_previous = np.r_[False, (ranked[1:] == ranked[:-1]).all(axis=1)]
     second = np.flatnonzero(same_as_previous & ~np.r_[False, same_as_previous[:-1]])
     left, right = corners[order[second - 1]], corners[order[second]]
-    return Mesh(faces, np.concatenate([left, right[:, 2:]], axis=1).astype(np.int32))
+    return Mesh(faces, np.concatenate([left, right[:, 2:]], axis=1).astype(np.int32), edges(faces))
 
 
 def edges(faces: np.ndarray) -> np.ndarray:

@@ -1,5 +1,5 @@
 """What flows between the modules. Letters: V garment vertices, B body vertices, J joints, S betas, F faces,
-H hinges, E directed edges, T frames, L latent size, K blend shapes. SI units, +Y up."""
+H hinges, E edges, T frames, L latent size, K blend shapes. SI units, +Y up."""
 
 from typing import NamedTuple
 
@@ -61,6 +61,7 @@ class Mesh(NamedTuple):
 
     faces: Array  # [F, 3] int32
     hinges: Array  # [H, 4] int32: edge (a, b), then the vertex opposite it in the left and the right face
+    edges: Array  # [E, 2] int32, undirected
 
 
 class Rest(NamedTuple):
@@ -80,7 +81,23 @@ class Contact(NamedTuple):
     point_next: Array  # [V, 3] m, the same surface point at the next frame
     normal: Array  # [V, 3] at the current frame
     normal_next: Array  # [V, 3] at the next frame
-    index: Array  # [V] int32 of the surface point
+    index: Array  # [V] int32, the body vertex nearest to it
+
+
+class EdgeContact(NamedTuple):
+    """The body surface each garment edge may touch between its ends, frozen for one time step."""
+
+    place: Array  # [E] from 0 at the edge's first vertex to 1 at its second
+    point_next: Array  # [E, 3] m, of the body at the next frame
+    normal_next: Array  # [E, 3]
+
+
+class SelfContact(NamedTuple):
+    """The place of the garment that each of its vertices may touch, frozen for one time step."""
+
+    corners: Array  # [V, 3] int32 vertices of the triangle
+    weights: Array  # [V, 3] barycentric coordinates
+    normal: Array  # [V, 3] from that place to the vertex
 
 
 class ClothState(NamedTuple):

@@ -161,7 +161,7 @@ def skinned_trajectory(whole: Experiment, character: Character, poses: Pose) -> 
     """Plain skinning [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
 
     def one(pose):
-        window = characters.window(whole.scene, character, pose, whole.config.physics)
+        window = characters.window(whole.scene, character, pose)
         return characters.skinned(character, window.current)
 
     return np.asarray(jax.jit(lambda p: jax.lax.map(one, p))(poses))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import contact, physics, rotation, topology
+from clothjax import contact, physics, proximity, rotation, topology
 
 DATA = Path(__file__).parent / "data"
 MU, LAM, STIFFNESS, DENSITY = 23600.0, 44400.0, 3.9625778333333325e-05, 0.20022  # HOOD's defaults
@@ -68,8 +68,7 @@ def test_hood_energies(hood, roll, x64):
     now, velocity = hood["cloth"][roll].copy(), hood["velocity"][roll].copy()
     now[hood["pinned"]], velocity[hood["pinned"]] = hood["cloth_target"][roll], 0.0
     new = hood["predicted"][roll]
-    body, following = (contact.centroids(hood[name][roll], hood["body_faces"]) for name in ("body", "body_next"))
-    touched = contact.find(now, body, following)
+    touched = contact.find_at_centroids(now, hood["body"][roll], hood["body_next"][roll], hood["body_faces"])
     values = {
         "stretching_energy": physics.stretching(new[mesh.faces], rest.inverse, rest.face_area, MU, LAM),
         "bending_energy": physics.bending(new[mesh.hinges], rest.hinge_area, rest.hinge_angle, STIFFNESS),
@@ -92,7 +91,7 @@ def test_hood_friction_with_its_traps(hood, x64):
     now, new = hood["cloth"][roll].copy(), hood["predicted"][roll]
     now[hood["pinned"]] = hood["cloth_target"][roll]
     before, after = (contact.centroids(hood[name][roll], hood["body_faces"]) for name in ("body_previous", "body"))
-    p, q = contact.nearest(now, before[0]), contact.nearest(new, after[0])
+    p, q = proximity.nearest_point(now, before[0]), proximity.nearest_point(new, after[0])
     near = (np.sum((now - before[0][p]) ** 2, axis=1) < 3e-3) & (np.sum((new - after[0][q]) ** 2, axis=1) < 3e-3)
     slip = new - (now + after[0][p] - before[0][p])
     normal = 0.5 * (before[1][p] + after[1][q])

@@ -10,7 +10,7 @@ import scipy.sparse
 from clothjax import losses, physics, solver, topology
 from clothjax.config import PhysicsConfig
 from clothjax.losses import TimeStep
-from clothjax.types import Contact, Material
+from clothjax.types import Contact, EdgeContact, Material, SelfContact
 
 CONFIG = PhysicsConfig()
 MATERIAL = Material(density=0.2, mu=23600.0, lam=44400.0, bending=3.96e-5)
@@ -33,7 +33,9 @@ def sheet(n=6, size=0.3):
     return vertices, topology.mesh(faces)
 
 
-def time_step(vertices, mesh, position=None, velocity=None, ground=-1e3, touching=False, dt=DT):
+def time_step(
+    vertices, mesh, position=None, velocity=None, ground=-1e3, touching=False, dt=DT, edges=False, self_contact=False
+):
     """A step over level ground at height `ground` m, in float64."""
     with jax.enable_x64(True):
         rest = jax.tree.map(np.asarray, physics.rest_measures(vertices, mesh))
@@ -49,7 +51,28 @@ def time_step(vertices, mesh, position=None, velocity=None, ground=-1e3, touchin
         contact=Contact(under, under, up, up, np.zeros(len(position), np.int32)),
         touching=np.full(len(position), touching),
         timestep=np.float64(dt),
+        edge_contact=on_ground(mesh, ground) if edges else None,
+        self_contact=on_a_far_triangle(position, mesh) if self_contact else None,
     )
+
+
+def on_ground(mesh, ground):
+    """Contact of the edges at all kinds of places."""
+    count = len(mesh.edges)
+    up, under = np.zeros((2, count, 3))
+    up[:, 1], under[:, 1] = 1.0, ground
+    return EdgeContact(np.random.default_rng(1).uniform(size=count), under, up)
+
+
+def on_a_far_triangle(position, mesh):
+    """Self-contact of every vertex with some triangle that it is no corner of, deep in it."""
+    count = len(position)
+    random = np.random.default_rng(2)
+    faces = [random.choice(np.flatnonzero((mesh.faces != vertex).all(axis=1))) for vertex in range(count)]
+    weights = random.dirichlet(np.ones(3), count)
+    offset = position - np.einsum("vk,vkc->vc", weights, position[mesh.faces[faces]])
+    normal = -offset / np.linalg.norm(offset, axis=1, keepdims=True)
+    return SelfContact(mesh.faces[faces], weights, normal)
 
 
 def crumpled(seed=0, **kwargs):
@@ -161,14 +184,16 @@ def test_the_result_is_a_minimum():
 
 
 def hessian_matrices(x, step, mesh):
-    pattern = solver.structure(mesh, len(x))
+    pattern = solver.structure(step, mesh)
     with jax.enable_x64(True):
         blocks = solver.hessians(x, jax.tree.map(jnp.asarray, step), mesh, pattern, CONFIG)
     return [scipy.sparse.bsr_array((np.asarray(b), pattern.indices, pattern.indptr)).toarray() for b in blocks]
 
 
-def test_hessian_is_that_of_finite_differences():
-    step, mesh = crumpled()
+@pytest.mark.parametrize("edges", [False, True])
+@pytest.mark.parametrize("self_contact", [False, True])
+def test_hessian_is_that_of_finite_differences(edges, self_contact):
+    step, mesh = crumpled(edges=edges, self_contact=self_contact)
     x = step.position + step.velocity
     exact, semidefinite = hessian_matrices(x, step, mesh)
     evaluate = potential(step, mesh)
@@ -238,17 +263,20 @@ def test_float32_in_float64_out_and_no_change_to_the_process():
     assert jnp.ones(3).dtype == np.float32
 
 
-@pytest.mark.parametrize("vertices", [36, 40])
-def test_structure_holds_every_pair_of_neighbours_once(vertices):
-    _, mesh = sheet()
-    pattern = solver.structure(mesh, vertices)
-    expected = np.eye(vertices, dtype=bool)
+def test_structure_holds_every_pair_of_neighbours_once():
+    step, mesh = crumpled(edges=True, self_contact=True)
+    pattern = solver.structure(step, mesh)
+    expected = np.eye(36, dtype=bool)
     for corners in (*mesh.faces, *mesh.hinges):
         expected[np.ix_(corners, corners)] = True
-    row = np.repeat(np.arange(vertices), np.diff(pattern.indptr))
-    assert len(row) == expected.sum() and expected[row, pattern.indices].all()
-    np.testing.assert_array_equal(row[pattern.diagonal], np.arange(vertices))
-    np.testing.assert_array_equal(pattern.indices[pattern.diagonal], np.arange(vertices))
+    apart = expected.sum()
+    for vertex, corners in enumerate(step.self_contact.corners):
+        both = [vertex, *corners]
+        expected[np.ix_(both, both)] = True
+    row = np.repeat(np.arange(36), np.diff(pattern.indptr))
+    assert len(row) == expected.sum() > apart and expected[row, pattern.indices].all()
+    np.testing.assert_array_equal(row[pattern.diagonal], np.arange(36))
+    np.testing.assert_array_equal(pattern.indices[pattern.diagonal], np.arange(36))
 
 
 def test_mistakes_are_named():

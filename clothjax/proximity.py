@@ -1,0 +1,190 @@
+"""What is nearest: the point of a cloud, the triangle of a mesh, the place on a triangle."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.types import Array
+
+BLOCK = 64  # points
+PATCH = 32  # triangles
+PASSES = 4  # of all positions, before only those without an answer are gone through
+CHUNK = 32  # of the positions, gone through together after that
+LAST = jnp.iinfo(jnp.int32).max
+
+
+class Patches(NamedTuple):
+    """The triangles of a mesh, and small groups of neighbours among them."""
+
+    faces: Array  # [F, 3] int32
+    across: Array  # [F, 3] int32, the face across the edge opposite a corner; itself where there is none
+    groups: Array  # [G, PATCH] int32, every face; the last of a group is repeated
+
+
+def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
+    """Patches of a mesh [B, 3] m: halved along the longest side of their box until they are small enough."""
+    faces = np.asarray(faces)
+    # half-edges (a, b) and (b, a) meet
+    start, end = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
+    other = {pair: index // 3 for index, pair in enumerate(zip(start.tolist(), end.tolist()))}
+    across = [other.get(pair, index // 3) for index, pair in enumerate(zip(end.tolist(), start.tolist()))]
+    centroids = np.asarray(vertices)[faces].mean(axis=1)
+
+    def halve(members: np.ndarray) -> list[np.ndarray]:
+        if len(members) <= PATCH:
+            return [np.pad(members, (0, PATCH - len(members)), mode="edge")]
+        axis = np.ptp(centroids[members], axis=0).argmax()
+        ordered = members[np.argsort(centroids[members, axis], kind="stable")]
+        half = PATCH * -(-len(members) // (2 * PATCH))
+        return halve(ordered[:half]) + halve(ordered[half:])
+
+    groups = np.stack(halve(np.arange(len(faces))))
+    return Patches(faces.astype(np.int32), np.reshape(across, (-1, 3)).astype(np.int32), groups.astype(np.int32))
+
+
+def nearest_point(positions: Array, points: Array) -> Array:
+    """Index [V] of the point [P, 3] m nearest to each position [V, 3] m; the first of equals.
+
+    Distances are taken about the points' centroid: |a|^2 - 2ab cancels badly far from the origin in float32.
+    """
+    centre = jnp.mean(points, axis=0, keepdims=True)
+    count = -(-points.shape[0] // BLOCK)
+    missing = count * BLOCK - points.shape[0]
+    local = points - centre
+    half = jnp.pad(0.5 * jnp.sum(local * local, axis=-1), (0, missing), constant_values=jnp.inf)
+    half = half.reshape(count, BLOCK)
+    local = jnp.pad(local, ((0, missing), (0, 0))).reshape(count, BLOCK, 3)
+    positions = positions - centre
+
+    def score(half, local, position):
+        # half the squared distance, without the part that does not depend on the point; written out, so that it
+        # fuses with the reduction and no [V, P] matrix is stored
+        x, y, z = (position[..., i] * local[..., i] for i in range(3))
+        return half - (x + y + z)
+
+    # the minimum of a block vectorises, its place does not: find the block, then the place in it
+    lowest = jnp.min(score(half[None], local[None], positions[:, None, None]), axis=-1)
+    block = jnp.argmin(lowest, axis=1)
+    place = jnp.argmin(score(half[block], local[block], positions[:, None]), axis=1)
+    return (block * BLOCK + place).astype(jnp.int32)
+
+
+def closest_on_triangle(positions: Array, corners: Array) -> tuple[Array, Array]:
+    """Barycentric coordinates [..., 3] of the point of a triangle [..., 3, 3] m nearest to [..., 3] m, and |.|^2 m^2.
+
+    Triangles without area are the segments they have shrunk to.
+    """
+    origin, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
+    b, c, p = b - origin, c - origin, positions - origin
+    v, w, squared = _closest(*(jnp.sum(x * y, axis=-1) for x, y in ((b, b), (b, c), (c, c), (b, p), (c, p), (p, p))))
+    return jnp.stack([1.0 - v - w, v, w], axis=-1), squared
+
+
+def _closest(bb: Array, bc: Array, cc: Array, bp: Array, cp: Array, pp: Array) -> tuple[Array, Array, Array]:
+    """(v, w) of the point v b + w c of the triangle (0, b, c) nearest to p, and |p - v b - w c|^2, from products."""
+    determinant = bb * cc - bc * bc
+    flat = determinant <= 0
+    safe = jnp.where(flat, 1.0, determinant)
+    v, w = (cc * bp - bc * cp) / safe, (bb * cp - bc * bp) / safe
+    inside = ~flat & (v >= 0) & (w >= 0) & (v + w <= 1)
+
+    def along(product, squared):
+        return jnp.clip(product / jnp.where(squared > 0, squared, 1.0), 0.0, 1.0)
+
+    def away(v, w):
+        # |v b + w c - p|^2 - |p|^2
+        return v * (v * bb + 2.0 * w * bc - 2.0 * bp) + w * (w * cc - 2.0 * cp)
+
+    zero = jnp.zeros_like(v)
+    third = along(cp - bp + bb - bc, bb - 2.0 * bc + cc)
+    best = jnp.where(inside, -jnp.inf, jnp.inf)
+    for side_v, side_w in ((along(bp, bb), zero), (zero, along(cp, cc)), (1.0 - third, third)):
+        distance = away(side_v, side_w)
+        better = distance < best
+        v, w, best = jnp.where(better, side_v, v), jnp.where(better, side_w, w), jnp.where(better, distance, best)
+    return v, w, pp + away(v, w)
+
+
+def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array | None = None) -> Array:
+    """Index [V] of the triangle [F, 3, 3] m nearest to each position [V, 3] m. Exact; no gradient.
+
+    Groups are gone through in the order of the distance of their boxes, until the next box is farther than the
+    nearest triangle found.
+
+    Args:
+        groups: [G, PATCH] of `patches`.
+        apart: [F, 3] int32, positions that a triangle is never the answer for: in a mesh's search of itself, its
+            corners.
+    """
+    positions, corners, groups = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, corners, groups)))
+    count, last_group = positions.shape[0], groups.shape[0] - 1
+    grouped = corners[groups]
+    low, high = jnp.min(grouped, axis=(1, 2)), jnp.max(grouped, axis=(1, 2))
+    # one coordinate after the other, so that a patch's triangles lie side by side
+    origin = grouped[:, :, 0]
+    b, c = grouped[:, :, 1] - origin, grouped[:, :, 2] - origin
+    products = jnp.stack([jnp.sum(x * y, axis=-1) for x, y in ((b, b), (b, c), (c, c))], axis=1)
+    table = jnp.concatenate([*(jnp.swapaxes(x, 1, 2) for x in (origin, b, c)), products], axis=1)  # [G, 12, PATCH]
+
+    def beyond(axis):
+        place = positions[:, None, axis]
+        return jnp.square(jnp.maximum(jnp.maximum(low[None, :, axis] - place, place - high[None, :, axis]), 0.0))
+
+    # the group in the last bits of its squared distance, which becomes a little less: then a minimum, which
+    # vectorises, gives both, and the next in order is the least above the last
+    bits = (1 << last_group.bit_length()) - 1
+    bound = jax.lax.bitcast_convert_type((beyond(0) + beyond(1) + beyond(2)).astype(jnp.float32), jnp.int32)
+    keys = (jnp.maximum(bound - 1, 0) & ~bits) | jnp.arange(groups.shape[0], dtype=jnp.int32)[None]
+
+    def following(keys, last):
+        return jnp.min(jnp.where(keys > last[:, None], keys, LAST), axis=1)
+
+    def may_improve(key, best):
+        return (key < LAST) & (jax.lax.bitcast_convert_type(key & ~bits, jnp.float32) < best)
+
+    def visit(number, position, keys, best, face, last):
+        key = following(keys, last)
+        group = jnp.minimum(key & bits, last_group)
+        found = table[group]
+        offset = [position[:, i, None] - found[:, i] for i in range(3)]
+        bp, cp, pp = (
+            other[0] * offset[0] + other[1] * offset[1] + other[2] * offset[2]
+            for other in ([found[:, 3 + i] for i in range(3)], [found[:, 6 + i] for i in range(3)], offset)
+        )
+        squared = _closest(found[:, 9], found[:, 10], found[:, 11], bp, cp, pp)[2]
+        if apart is not None:
+            own = jnp.any(jnp.asarray(apart)[groups[group]] == number[:, None, None], axis=-1)
+            squared = jnp.where(own, jnp.inf, squared)
+        least = jnp.min(squared, axis=1)
+        place = jnp.min(jnp.where(squared == least[:, None], jnp.arange(PATCH)[None], PATCH - 1), axis=1)
+        better = may_improve(key, best) & (least < best)
+        return jnp.where(better, least, best), jnp.where(better, groups[group, place], face), key
+
+    number = jnp.arange(count)
+    best, face = jnp.full(count, jnp.inf, positions.dtype), jnp.zeros(count, groups.dtype)
+    last = jnp.full(count, -1, jnp.int32)
+    for _ in range(min(PASSES, last_group + 1)):
+        best, face, last = visit(number, positions, keys, best, face, last)
+    left = may_improve(following(keys, last), best)
+    (rows,) = jnp.nonzero(left, size=-(-count // CHUNK) * CHUNK, fill_value=count)
+
+    def chunk(index, state):
+        best, face = state
+        row = jax.lax.dynamic_slice(rows, (index * CHUNK,), (CHUNK,))
+        real = row < count
+        row_or_last = jnp.minimum(row, count - 1)
+        position, key = positions[row_or_last], keys[row_or_last]
+
+        def more(state):
+            best, face, last, _ = state
+            best, face, last = visit(row_or_last, position, key, best, face, last)
+            return best, face, last, real & may_improve(following(key, last), best)
+
+        state = (best[row_or_last], face[row_or_last], last[row_or_last], real)
+        found, found_face, _, _ = jax.lax.while_loop(lambda state: jnp.any(state[3]), more, state)
+        return best.at[row].set(found, mode="drop"), face.at[row].set(found_face, mode="drop")
+
+    chunks = -(-jnp.sum(left) // CHUNK)
+    return jax.lax.fori_loop(0, chunks, chunk, (best, face))[1]
