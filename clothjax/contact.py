@@ -7,6 +7,7 @@ from clothjax.proximity import Patches, closest_on_triangle, nearest_face, neare
 from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
+LEVEL = 1e-4  # m, planes that differ by less are one
 
 
 def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> Contact:
@@ -53,7 +54,7 @@ def find_at_edges(
     def beyond(position, own, other):
         # how much farther an end is from its own plane than from that of the other end
         mine, its = (distance(position, planes.point[i], planes.normal[i]) for i in (own, other))
-        return jnp.maximum(mine - its, 0.0) + ON_SURFACE
+        return jnp.maximum(mine - its, 0.0) + LEVEL
 
     before, after = beyond(start, a, b), beyond(end, b, a)
     place = jax.lax.stop_gradient(before / (before + after))

@@ -1,4 +1,10 @@
-"""Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame."""
+"""Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
+
+A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
+`latent_predictor.MARGIN` times the range that they had in training, and a pose that is not finite is taken to be the
+last one: whatever comes in, the garment stays finite and plausible, and when the input is ordinary again the code
+forgets the rest within a second. `State.ok` tells of every frame whether nothing of this was needed.
+"""
 
 import dataclasses
 from functools import partial
@@ -11,8 +17,7 @@ import numpy as np
 
 from clothjax import checkpoint, configuration, garment_model, latent_predictor, skinning, storage
 from clothjax.config import Config
-from clothjax.features import Statistics
-from clothjax.latent_predictor import Normalizers
+from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import Array, Body, Garment, Material, Motion, Pose
 
 
@@ -42,6 +47,7 @@ class State(NamedTuple):
     latent: Array  # [L] in standard deviations
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
     translation: Array  # [2, 3] m
+    ok: Array  # bool, whether the last frame was within the range of training
 
 
 def build(
@@ -98,19 +104,28 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
         storage.joint_names(config.body),
         parts["garment"],
         parts["average"],
-        Normalizers(*(Statistics(**parts["normalizers"][name]) for name in Normalizers._fields)),
+        Normalizers(*(Scale(**parts["normalizers"][name]) for name in Normalizers._fields)),
         betas=betas,
         material=material,
     )
 
 
 def initial_state(model: Model, pose: Pose) -> State:
-    """The state before the first frame: the code is zero and the character has been standing in `pose`."""
+    """The state before the first frame: the code is zero and the character has been standing in `pose`.
+
+    Of a pose that is not finite, the canonical one takes the place.
+    """
     size = model.normalizers.latent.mean.shape[0]
     zero = latent_predictor.normalise(model.normalizers.latent, jnp.zeros(size))
-    rotations = jnp.asarray(pose.rotations, jnp.float32)
-    translation = jnp.asarray(pose.translation, jnp.float32)
-    return State(zero, jnp.stack([rotations, rotations]), jnp.stack([translation, translation]))
+    pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
+    still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
+    pose, ok = _finite_or(pose, still)
+    return State(zero, *(jnp.stack([x, x]) for x in pose), ok)
+
+
+def _finite_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
+    finite = jnp.all(jnp.isfinite(pose.rotations)) & jnp.all(jnp.isfinite(pose.translation))
+    return jax.tree.map(lambda x, y: jnp.where(finite, x, y), pose, other), finite
 
 
 @jax.jit
@@ -121,18 +136,20 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
     """
     parents = np.array(model.parents)
+    pose, finite = _finite_or(pose, Pose(state.rotations[0], state.translation[0]))
     rotations = jnp.concatenate([pose.rotations[None], state.rotations])
     advance = jnp.stack([pose.translation - state.translation[0], state.translation[0] - state.translation[1]])
     inputs = latent_predictor.pose_inputs(
         rotations, advance, model.joints, parents, np.array(model.kept), model.config.fps
     )
+    scales = model.normalizers
+    inputs = latent_predictor.normalise(scales.pose, inputs)
+    inputs, ordinary = latent_predictor.bounded(inputs, scales.pose.low, scales.pose.high)
+    constants, known = latent_predictor.bounded_constants(model.constants, model.config)
     latent = latent_predictor.predict(
-        model.predictor,
-        state.latent,
-        latent_predictor.normalise(model.normalizers.pose, inputs, bound=latent_predictor.POSE_BOUND),
-        model.constants,
-        model.config.stage2.latent_decay,
+        model.predictor, state.latent, inputs, constants, model.config.stage2.latent_decay
     )
+    latent, bounded = latent_predictor.bounded(latent, scales.latent.low, scales.latent.high)
     code = latent_predictor.denormalise(model.normalizers.latent, latent)
     free = 1.0 - model.garment.pinned.astype(code.dtype)
     displaced = garment_model.displacement(model.garment_params, code, free, model.config.model)
@@ -140,17 +157,22 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
     vertices = garment_model.vertices(
         displaced, model.garment.vertices, skinning.blend(model.garment.weights, transforms)
     )
-    following = State(latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]]))
+    ok = finite & ordinary & known & bounded
+    following = State(latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]]), ok)
     return following, vertices + pose.translation[None]
 
 
 @jax.jit
 def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
-    """A whole motion: vertices [T, V, 3] m in the world, and whether each frame is finite, `ok` [T].
+    """A whole motion: vertices [T, V, 3] m in the world, and `ok` [T], as in `State`, of each frame.
 
     The first frame is the garment settled on the standing first pose.
     """
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
     first = jax.tree.map(lambda x: x[0], poses)
-    _, vertices = jax.lax.scan(lambda s, p: step(model, s, p), initial_state(model, first), poses)
-    return vertices, jnp.all(jnp.isfinite(vertices), axis=(1, 2))
+
+    def frame(state, pose):
+        state, vertices = step(model, state, pose)
+        return state, (vertices, state.ok)
+
+    return jax.lax.scan(frame, initial_state(model, first), poses)[1]

@@ -7,19 +7,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import features, rotation, skinning
-from clothjax.config import MaterialConfig, Stage2Config
-from clothjax.features import Statistics
+from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.graph_network import Params, init_mlp, mlp
 from clothjax.types import Array, Material
 
-POSE_BOUND = 10.0  # standard deviations beyond which a pose input tells nothing that training has seen
+MARGIN = 1.2  # times the range seen in training, beyond which the predictor is not asked
+ROUNDING = 1e-3  # standard deviations
+
+
+class Scale(NamedTuple):
+    """How rows [N] are made comparable, and the range they were in over the teacher's rollouts."""
+
+    mean: Array  # [N]
+    deviation: Array  # [N]
+    low: Array  # [N] the least and ...
+    high: Array  # [N] ... the greatest seen, in standard deviations from the mean
 
 
 class Normalizers(NamedTuple):
-    """Statistics of the predictor's inputs and outputs over the teacher's rollouts."""
+    """Scales of the predictor's inputs and outputs."""
 
-    latent: Statistics  # [L]
-    pose: Statistics  # [P]
+    latent: Scale  # [L]
+    pose: Scale  # [P]
 
 
 def kept_joints(names: tuple[str, ...], config: Stage2Config) -> np.ndarray:
@@ -57,6 +66,14 @@ def constant_inputs(betas: Array, material: Material, config: MaterialConfig) ->
     return jnp.concatenate([betas, density[None], features.material_inputs(material, config)])
 
 
+def bounded_constants(constants: Array, config: Config) -> tuple[Array, Array]:
+    """Constants [S + 4] brought into `MARGIN` times the range of training, and whether they were there."""
+    count = constants.shape[0] - len(Material._fields)
+    betas = jnp.full(count, config.stage1.betas)
+    materials = jnp.ones(len(Material._fields))
+    return bounded(constants, jnp.concatenate([-betas, 0 * materials]), jnp.concatenate([betas, materials]))
+
+
 def init(key: Array, latent: int, pose: int, constants: int, config: Stage2Config) -> Params:
     """Parameters of the predictor; its last layer starts small, so that it first keeps the code as it is."""
     sizes = (latent + pose + constants, *config.hidden, latent)
@@ -71,25 +88,29 @@ def predict(params: Params, latent: Array, pose: Array, constants: Array, decay:
     return (1.0 - decay) * latent + mlp(params, jnp.concatenate([latent, pose, constants]))
 
 
-def normalise(statistics: Statistics, row: Array, bound: float = jnp.inf) -> Array:
-    """A row [N] in standard deviations from the mean, clipped to `bound` of them."""
-    return jnp.clip((row - statistics.mean) / _deviation(statistics), -bound, bound)
+def normalise(scale: Scale, row: Array) -> Array:
+    """A row [N] in standard deviations from the mean."""
+    return (row - scale.mean) / scale.deviation
 
 
-def denormalise(statistics: Statistics, row: Array) -> Array:
-    """The inverse of `normalise` within its bound."""
-    return row * _deviation(statistics) + statistics.mean
+def denormalise(scale: Scale, row: Array) -> Array:
+    """The inverse of `normalise`."""
+    return row * scale.deviation + scale.mean
 
 
-def measure(rows: np.ndarray) -> Statistics:
-    """Statistics of rows [N, columns]."""
+def bounded(row: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """A row [N] brought into `MARGIN` times the range [low, high], and whether it was there."""
+    middle, half = 0.5 * (high + low), 0.5 * (high - low)
+    reach = MARGIN * half + ROUNDING
+    inside = jnp.clip(row, middle - reach, middle + reach)
+    return inside, jnp.all(inside == row)
+
+
+def measure(rows: np.ndarray) -> Scale:
+    """The scale of rows [n, N]."""
     rows = np.asarray(rows, np.float64)
-    return Statistics(
-        jnp.asarray(rows.mean(0), jnp.float32), jnp.asarray(rows.var(0), jnp.float32), jnp.float32(len(rows))
-    )
-
-
-def _deviation(statistics: Statistics) -> Array:
+    mean, deviation = rows.mean(0), rows.std(0)
     # a column that never changed in training is left alone, not blown up
-    deviation = jnp.sqrt(statistics.variance)
-    return jnp.where(deviation > 1e-6, deviation, 1.0)
+    deviation = np.where(deviation > 1e-6, deviation, 1.0)
+    low, high = (rows.min(0) - mean) / deviation, (rows.max(0) - mean) / deviation
+    return Scale(*(jnp.asarray(x, jnp.float32) for x in (mean, deviation, low, high)))

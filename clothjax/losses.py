@@ -71,15 +71,16 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
 def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig) -> Array:
     """Collision energy [...] J of edges [..., 2, 3] m at the places that touch."""
     start, end = ends[..., 0, :], ends[..., 1, :]
-    point = start + contact.place[..., None] * (end - start)
-    distance = contacts.distance(point, contact.point_next, contact.normal_next)
+    # differences first: far from the origin the place itself is coarse
+    offset = (start - contact.point_next) + contact.place[..., None] * (end - start)
+    distance = jnp.sum(offset * contact.normal_next, axis=-1)
     return config.collision_stiffness * physics.collision(distance, config.collision_offset)
 
 
 def self_collision(points: Array, contact: SelfContact, config: PhysicsConfig) -> Array:
     """Collision energy [...] J of vertices and the corners of the triangles they may touch [..., 4, 3] m."""
-    place = jnp.sum(contact.weights[..., :, None] * points[..., 1:, :], axis=-2)
-    distance = contacts.distance(points[..., 0, :], place, contact.normal)
+    offset = jnp.sum(contact.weights[..., :, None] * (points[..., :1, :] - points[..., 1:, :]), axis=-2)
+    distance = jnp.sum(offset * contact.normal, axis=-1)
     return config.collision_stiffness * physics.collision(distance, config.self_offset)
 
 

@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import character as characters
-from clothjax import losses, rollout, skinning, solver, topology
+from clothjax import losses, simulation, skinning, solver, topology
 from clothjax.character import Character
 from clothjax.config import Config
 from clothjax.losses import TimeStep
 from clothjax.scene import Scene
-from clothjax.types import Array, Body, ClothState, Pose
+from clothjax.types import Array, Body, Pose
 
 
 class StepMeasure(NamedTuple):
@@ -43,15 +42,7 @@ def step_measures(
         frames: from 1 to T - 1.
     """
 
-    @jax.jit
-    def at(before: Array, now: Array, after: Array, poses: Pose):
-        window = characters.window(scene, character, poses)
-        state = _state(before + poses.translation[0][None], now)
-        step = rollout.time_step(scene, character, state, window, 1.0 / config.fps, config)
-        new = after + poses.translation[2][None]
-        held = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
-        skinned = characters.skinned(character, window.following)
-        return step, new, jnp.where(scene.garment.pinned[:, None], skinned, held), skinned
+    state = simulation.problem(scene, character, config)
 
     def energy(new: Array, step: TimeStep) -> float:
         # float64 on the host, as the solver has it: differences of energies are small
@@ -61,9 +52,10 @@ def step_measures(
 
     measures = []
     for frame in frames:
-        step, new, held, skinned = at(
-            trajectory[frame - 1], trajectory[frame], trajectory[frame + 1], _at(poses, frame)
+        step, skinned, held, advance = state(
+            trajectory[frame - 1], trajectory[frame], jax.tree.map(lambda x, t=frame: x[t], poses)
         )
+        new = trajectory[frame + 1] + advance[None]
         taken, kept = energy(new, step), energy(held, step)
         # two starts, the better end: folds have many minima
         ends = [
@@ -73,48 +65,6 @@ def step_measures(
         error = np.linalg.norm(best - np.asarray(new, np.float64), axis=-1)
         measures.append(StepMeasure(taken, info.energy, energy(skinned, step), kept, error, info.converged))
     return measures
-
-
-def simulate(scene: Scene, character: Character, poses: Pose, config: Config) -> tuple[np.ndarray, list[bool]]:
-    """The reference solver in closed loop: a trajectory [T + 1, V, 3] m and whether each step converged.
-
-    It starts like Phi: skinned, then one quasi-static step.
-    """
-
-    @jax.jit
-    def begin(poses):
-        window = characters.window(scene, character, poses)
-        state = rollout.start(character, window, 0)
-        still = characters.Window(window.current, window.current, window.current)
-        resting = state._replace(velocity=jnp.zeros_like(state.velocity))
-        long = rollout.time_step(
-            scene, character, resting, still, config.stage1.start_timestep or 1 / config.fps, config
-        )
-        return state, long
-
-    @jax.jit
-    def constants(before, now, poses):
-        window = characters.window(scene, character, poses)
-        state = _state(before + poses.translation[0][None], now)
-        step = rollout.time_step(scene, character, state, window, 1.0 / config.fps, config)
-        transforms = window.following.garment
-        held = skinning.apply(transforms, skinning.unapply(window.current.garment, now))
-        return step, jnp.where(scene.garment.pinned[:, None], characters.skinned(character, window.following), held)
-
-    def solve(guess, step):
-        new, info = solver.solve_step(guess, step, scene.mesh, scene.garment.pinned, config.physics)
-        return np.asarray(new, np.float32), info.converged
-
-    state, long = begin(_at(poses, 0))
-    settled, converged = solve(state.position, long)
-    before = settled - np.asarray(state.velocity) - np.asarray(poses.translation[0, 0])[None]
-    trajectory, flags = [settled], [converged]
-    for frame in range(poses.translation.shape[0] - 1):
-        new, converged = solve(*constants(before, trajectory[-1], _at(poses, frame))[::-1])
-        before = trajectory[-1]
-        trajectory.append(new - np.asarray(poses.translation[frame, 2])[None])
-        flags.append(converged)
-    return np.stack(trajectory), flags
 
 
 def gaps(measures: list[StepMeasure]) -> dict[str, float]:
@@ -203,14 +153,6 @@ def roughness(trajectory: Array, advance: Array) -> float:
 def distance_mm(one: Array, other: Array) -> np.ndarray:
     """Mean vertex distance in mm of each frame of two trajectories [T, V, 3] m: [T]."""
     return 1e3 * np.linalg.norm(np.asarray(one, np.float64) - np.asarray(other, np.float64), axis=-1).mean(-1)
-
-
-def _state(before: Array, now: Array) -> ClothState:
-    return ClothState(now, now - before, jnp.zeros_like(now), jnp.zeros(0, now.dtype))
-
-
-def _at(poses: Pose, frame: int) -> Pose:
-    return Pose(poses.rotations[frame], poses.translation[frame])
 
 
 def _double(x: Array) -> np.ndarray:

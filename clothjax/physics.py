@@ -13,6 +13,7 @@ from clothjax.types import Array, Mesh, Rest
 
 GRAVITY = 9.81  # m/s^2
 THICKNESS = 4.7e-4  # m, of the StVK membrane, HOOD and SNUG
+SLIVER = 1e-6  # of a hinge's squared size, twice the area of a face that has no direction
 COLLISION_OFFSET = 3e-3  # m, the cloth is pushed out to this distance from the body
 
 
@@ -58,15 +59,20 @@ def stretching(corners: Array, inverse: Array, area: Array, mu: Array, lam: Arra
 
 
 def dihedral_angle(corners: Array) -> Array:
-    """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 if flat, or where a face has no area."""
-    edge = corners[:, 1] - corners[:, 0]
-    left = jnp.cross(edge, corners[:, 2] - corners[:, 0])
-    right = jnp.cross(corners[:, 3] - corners[:, 0], edge)
+    """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 if flat, or where a face has hardly any area."""
+    offsets = corners[:, 1:] - corners[:, :1]
+    # the angle has no size, what it is made of is of fifth order in length: that would underflow in float32
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(offsets), axis=(1, 2), keepdims=True))
+    offsets = offsets / jnp.where(size > 0, size, 1.0)
+    edge = offsets[:, 0]
+    left = jnp.cross(edge, offsets[:, 1])
+    right = jnp.cross(offsets[:, 2], edge)
     sine = jnp.sum(jnp.cross(left, right) * edge, axis=-1)
     cosine = jnp.sum(left * right, axis=-1) * _norm(edge)
-    # of fifth order in length: arctan2's derivative squares them, which underflows in float32 below 0.1 mm
+    # small again where faces are slivers, and arctan2's derivative squares them
     scale = jax.lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
-    degenerate = scale == 0
+    area = jnp.minimum(jnp.sum(left * left, axis=-1), jnp.sum(right * right, axis=-1))
+    degenerate = (area < SLIVER * SLIVER) | (scale == 0)
     scale = jnp.where(degenerate, 1.0, scale)
     return jnp.where(degenerate, 0.0, jnp.arctan2(sine / scale, jnp.where(degenerate, 1.0, cosine / scale)))
 

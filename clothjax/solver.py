@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from clothjax import losses, physics
+from clothjax import contact, losses, physics
 from clothjax.config import PhysicsConfig
 from clothjax.losses import TimeStep
 from clothjax.types import Array, Mesh
@@ -20,6 +20,10 @@ from clothjax.types import Array, Mesh
 VERTEX_TERMS = ("gravity", "inertia", "friction", "collision")
 CG_ITERATIONS = 600
 SHORTEST_STEP = 1e-8
+ROUNDING = 1e-13  # of the sum of all energies, without signs
+TORN = 2.0  # times the length at rest
+SUNK = 0.01  # m
+TOLERANCE = 1e-6  # of the remaining force, over the weight
 
 
 class Structure(NamedTuple):
@@ -39,6 +43,13 @@ class SolverInfo(NamedTuple):
     gradient_norm: float  # N, of the free vertices
     relative_gradient: float  # gradient_norm over the norm of the free vertices' weights
     energy: float  # J
+    stretch: float  # the largest of a face in any direction, 1 at rest
+    depth: float  # m, of the vertex that is farthest behind the surface that it may touch
+
+    @property
+    def ok(self) -> bool:
+        """Whether this is cloth, too: a minimum can be of a step that nothing could have taken well."""
+        return self.converged and self.stretch < TORN and self.depth < SUNK
 
 
 def structure(step: TimeStep, mesh: Mesh) -> Structure:
@@ -77,7 +88,7 @@ def solve_step(
     pinned: Array,
     config: PhysicsConfig,
     *,
-    tolerance: float = 1e-6,
+    tolerance: float = TOLERANCE,
     max_iterations: int = 500,
 ) -> tuple[np.ndarray, SolverInfo]:
     """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
@@ -97,7 +108,8 @@ def solve_step(
         max_iterations: Newton iterations.
 
     Returns:
-        Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met.
+        Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met, `ok`
+        also where a face is stretched to twice its length or a vertex is deep in the body.
 
     Raises:
         ValueError: a start that is not finite, or a vertex without mass.
@@ -112,7 +124,7 @@ def solve_step(
 
     with jax.enable_x64(True):
         evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config)
-        energy, gradient = _host(evaluate(x), free)
+        energy, gradient, _ = _host(evaluate(x), free)
         iterations = 0
         while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
             exact, semidefinite = hessians(x, step, mesh, pattern, config)
@@ -125,8 +137,9 @@ def solve_step(
             x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
             if not moved:
                 break
+        stretch, depth = (float(value) for value in _condition(x, step, mesh))
     norm = float(np.linalg.norm(gradient))
-    return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy)
+    return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy, stretch, depth)
 
 
 def hessians(
@@ -239,12 +252,29 @@ def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
 
 @partial(jax.jit, static_argnames="config")
 def _value_and_gradient(x, step, mesh, config):
-    return jax.value_and_grad(losses.potential)(x, step, mesh, config)
+    """The potential, its gradient, and what rounding can do to the potential."""
+
+    def potential(x):
+        elements = losses.elements(x, step, mesh, config)
+        return sum(jnp.sum(values) for values in elements.values()), elements
+
+    (energy, elements), gradient = jax.value_and_grad(potential, has_aux=True)(x)
+    return energy, gradient, ROUNDING * sum(jnp.sum(jnp.abs(values)) for values in elements.values())
 
 
-def _host(result, free) -> tuple[float, np.ndarray]:
-    energy, gradient = result
-    return float(energy), np.where(free, np.asarray(gradient), 0.0)
+@jax.jit
+def _condition(x: Array, step: TimeStep, mesh: Mesh) -> tuple[Array, Array]:
+    """The largest stretch of a face and the deepest vertex in m."""
+    strain = physics.green_strain(x[mesh.faces], step.rest.inverse)
+    mean, spread = 0.5 * (strain[:, 0, 0] + strain[:, 1, 1]), 0.5 * (strain[:, 0, 0] - strain[:, 1, 1])
+    largest = mean + jnp.sqrt(spread * spread + strain[:, 0, 1] * strain[:, 0, 1])
+    distance = contact.distance(x, step.contact.point_next, step.contact.normal_next)
+    return jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest), 0.0)), jnp.maximum(-jnp.min(distance), 0.0)
+
+
+def _host(result, free) -> tuple[float, np.ndarray, float]:
+    energy, gradient, rounding = result
+    return float(energy), np.where(free, np.asarray(gradient), 0.0), float(rounding)
 
 
 def _check(x: np.ndarray, step: TimeStep) -> None:
@@ -294,14 +324,17 @@ def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) 
 
 
 def _line_search(evaluate, x, energy, gradient, direction, free):
-    """Backtracking (Armijo) from x; the last result is whether a point with less energy was found."""
+    """Backtracking (Armijo) from x; the last result is whether a better point was found."""
     slope = float(np.sum(gradient * direction))
+    squared = float(np.sum(gradient * gradient))
     length = 1.0
     while length >= SHORTEST_STEP:
         trial = x + length * direction
-        trial_energy, trial_gradient = _host(evaluate(trial), free)
-        # the last term: near the minimum the decrease drowns in the rounding of the energy
-        if trial_energy <= energy + 1e-4 * length * slope + 1e-14 * abs(energy):
+        trial_energy, trial_gradient, rounding = _host(evaluate(trial), free)
+        lower = trial_energy <= energy + 1e-4 * length * slope
+        # near the minimum the decrease drowns in the rounding of the energy, but not that of the gradient
+        level = abs(trial_energy - energy) <= rounding and float(np.sum(trial_gradient * trial_gradient)) < squared
+        if lower or level:
             return trial, trial_energy, trial_gradient, True
         length *= 0.5
     return x, energy, gradient, False

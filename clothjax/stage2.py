@@ -154,9 +154,7 @@ def rollout_loss(
     """
     stage, normalizers = config.stage2, state.normalizers
     targets = jax.vmap(lambda z: latent_predictor.normalise(normalizers.latent, z))(latents)
-    poses = jax.vmap(lambda x: latent_predictor.normalise(normalizers.pose, x, bound=latent_predictor.POSE_BOUND))(
-        poses
-    )
+    poses = jax.vmap(lambda x: latent_predictor.normalise(normalizers.pose, x))(poses)
     noise = stage.noise * jax.random.normal(key, targets[0].shape)
 
     def weights(latent):

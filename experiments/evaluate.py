@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import character as characters
-from clothjax import clips, experiment, inference, metrics, rollout
+from clothjax import clips, experiment, inference, metrics, rollout, simulation
 from clothjax.character import Character
 from clothjax.experiment import Experiment
 from clothjax.types import Motion, Pose
@@ -97,7 +97,7 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
     tracks["phi"] = phi_trajectory(whole, phi, character, poses)
     tracks["psi"] = psi_trajectory(psi, clip)
     done(1)
-    solved, converged = metrics.simulate(
+    solved, infos = simulation.simulate(
         whole.scene,
         character,
         jax.tree.map(lambda x: x[: min(config.evaluation.solver_frames, frames)], poses),
@@ -108,7 +108,7 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
     count = len(solved)
     rough = metrics.roughness(solved[SETTLING:], advance[SETTLING : count - 1])
     sampled = np.unique(np.linspace(SETTLING, frames - 2, config.evaluation.gap_frames).astype(int))
-    result = {"solver": {"frames": count, "converged": float(np.mean(converged))}}
+    result = {"solver": {"frames": count, "converged": float(np.mean([info.converged for info in infos]))}}
     for stage, track in tracks.items():
         measured = metrics.gaps(
             metrics.step_measures(whole.scene, character, jnp.asarray(track), poses, sampled, config)

@@ -81,7 +81,7 @@ def write_comparison(run: Path, whole: Experiment, motion: str, out: Path, frame
         tracks = {name: tracks[name] for name in ROWS}
     clip = experiment.motion(whole, motion)
     body, root = body_trajectory(whole, clip)
-    moments = np.linspace(0, len(tracks["solver"]) - 1, 6)[1:].astype(int)
+    moments = np.linspace(0, min(map(len, tracks.values())) - 1, 6)[1:].astype(int)
     floor = float((body + root[:, None])[moments][..., 1].min())
     camera = animation.camera_for(body[moments])
     rows = {

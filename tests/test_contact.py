@@ -137,3 +137,106 @@ def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     # the same triangles at the next frame
     advanced = contact.find(planes.point_next, *2 * (window.following.body,), scene.patches)
     np.testing.assert_allclose(contact.distance(planes.point_next, advanced.point, advanced.normal), 0.0, atol=1e-5)
+
+
+def limb(half_width=0.01):
+    """A bar along z, 20 mm wide: (vertices, faces)."""
+    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = ConvexHull(corner).simplices
+    a, b, c = np.moveaxis(corner[faces], 1, 0)
+    inwards = np.sum(np.cross(b - a, c - a) * (a + b + c), axis=1) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return (corner * [half_width, 0.02, 0.3]).astype(np.float32), faces
+
+
+@pytest.mark.parametrize("height", [0.025, 0.021, 0.018])
+@pytest.mark.parametrize("aside", [0.0, 0.004, 0.015])
+def test_a_thin_limb_is_felt_between_two_vertices(height, aside):
+    """An edge of 60 mm lies across a bar of 20 mm, whose top is at 20 mm; both ends are far from it."""
+    vertices, faces = limb()
+    across = np.array([[-0.03 + aside, height, 0.013], [0.03 + aside, height, 0.013], [0.0, 1.0, 0.0]], np.float32)
+    mesh, patches = topology.mesh(np.array([[0, 1, 2]])), proximity.patches(vertices, faces)
+    planes = contact.find(across, vertices, vertices, patches)
+    assert (contact.distance(across, planes.point, planes.normal)[:2] > 4.9e-3).all()
+    found = contact.find_at_edges(across, planes, mesh, vertices, vertices, patches)
+    edge = [tuple(e) for e in mesh.edges.tolist()].index((0, 1))
+    place = across[0] + float(found.place[edge]) * (across[1] - across[0])
+    assert abs(place[0]) <= 0.01  # above the bar
+    distance = contact.distance(place[None], found.point_next[edge : edge + 1], found.normal_next[edge : edge + 1])
+    np.testing.assert_allclose(distance, height - 0.02, atol=1e-6)
+
+
+def test_an_edge_across_the_edge_of_a_body_touches_where_the_two_cross():
+    """A garment's edge over a ridge, at all angles: the distance is that of the two lines."""
+    random = np.random.default_rng(0)
+    ridge = np.array([[0, 0, -1], [0, 0, 1], [-1, -1, -1], [-1, -1, 1], [1, -1, -1], [1, -1, 1]], np.float32)
+    faces = np.array([[0, 3, 1], [0, 2, 3], [1, 4, 0], [1, 5, 4]])
+    patches = proximity.patches(ridge, faces)
+    mesh = topology.mesh(np.array([[0, 1, 2]]))
+    edge = [tuple(e) for e in mesh.edges.tolist()].index((0, 1))
+    for _ in range(50):
+        lean, height, half = random.uniform(-0.3, 0.3), random.uniform(-0.005, 0.01), 0.03
+        ends = np.array([[-half, height, -half * lean], [half, height, half * lean], [0, 1, 0]], np.float32)
+        planes = contact.find(ends, ridge, ridge, patches)
+        found = contact.find_at_edges(ends, planes, mesh, ridge, ridge, patches)
+        place = ends[0] + float(found.place[edge]) * (ends[1] - ends[0])
+        distance = contact.distance(place[None], found.point_next[edge : edge + 1], found.normal_next[edge : edge + 1])
+        # crossing lines at right angles to the vertical: above by the height, below by its way out through a side
+        np.testing.assert_allclose(distance, height if height > 0 else height / np.sqrt(2), atol=1e-5)
+
+
+def test_a_flat_body_touches_an_edge_in_its_middle_also_where_they_are_parallel():
+    vertices, faces = limb(0.1)
+    for ends in ([[-0.05, 0.022, 0.0], [0.05, 0.022, 0.0]], [[0.0, 0.02, -0.05], [0.0, 0.02, 0.05]]):
+        positions = np.array([*ends, [0, 1, 0]], np.float32)
+        patches, mesh = proximity.patches(vertices, faces), topology.mesh(np.array([[0, 1, 2]]))
+        planes = contact.find(positions, vertices, vertices, patches)
+        found = contact.find_at_edges(positions, planes, mesh, vertices, vertices, patches)
+        edge = [tuple(e) for e in mesh.edges.tolist()].index((0, 1))
+        # 1e-8 m of rounding tilt a normal over 2 mm, which the length of 10 cm makes 1e-6 m of the 1e-4 m that are level
+        np.testing.assert_allclose(found.place[edge], 0.5, atol=0.05)
+        np.testing.assert_allclose(found.normal_next[edge], [0, 1, 0], atol=1e-5)
+
+
+def test_an_edge_without_length_and_a_body_without_area_give_finite_contact():
+    vertices, faces = limb()
+    flat = vertices * np.float32([0, 1, 1])
+    positions = np.array([[0.0, 0.02, 0.0], [0.0, 0.02, 0.0], [0.0, 0.02, 0.0]], np.float32)
+    mesh = topology.mesh(np.array([[0, 1, 2]]))
+    for body in (vertices, flat, 0 * vertices):
+        patches = proximity.patches(vertices, faces)
+
+        def total(positions, body=body, patches=patches):
+            planes = contact.find(positions, body, body, patches)
+            found = contact.find_at_edges(positions, planes, mesh, body, body, patches)
+            return sum(jnp.sum(x) for x in jax.tree.leaves(found))
+
+        value, gradient = jax.value_and_grad(total)(jnp.asarray(positions))
+        assert np.isfinite(value) and np.isfinite(gradient).all()
+
+
+def test_a_garment_touches_itself_at_its_nearest_other_triangle():
+    """Two parallel sheets: each vertex of one meets the other straight across, and none its own triangles."""
+    random = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 0.3, 7)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    i, j = np.divmod(np.arange(36), 6)
+    a = i * 7 + j
+    one = np.concatenate([np.stack([a, a + 7, a + 1], 1), np.stack([a + 7, a + 8, a + 1], 1)])
+    low = np.insert(grid, 1, 0.0, axis=1)
+    shift = np.array([[0.01, 4e-3, 0.015]])
+    positions = np.concatenate([low, low + shift]).astype(np.float32)
+    faces = np.concatenate([one, one + 49])
+    found = contact.find_on_self(positions, proximity.patches(positions, faces))
+    assert not (found.corners == np.arange(98)[:, None]).any()
+    place = np.einsum("vk,vkc->vc", found.weights, positions[found.corners])
+    inner = np.r_[8:13, 15:20, 22:27]  # vertices of the lower sheet that have the upper one above them
+    np.testing.assert_allclose(place[inner], positions[inner] + np.array([0, 4e-3, 0]), atol=1e-6)
+    np.testing.assert_allclose(found.normal[inner], np.tile([[0, -1, 0]], (len(inner), 1)), atol=1e-4)
+    # against libigl, with the triangles of each vertex taken away
+    for vertex in random.choice(98, 20, replace=False):
+        others = faces[(faces != vertex).all(axis=1)]
+        expected = igl.point_mesh_squared_distance(
+            positions[vertex : vertex + 1].astype(np.float64), positions.astype(np.float64), others
+        )[0]
+        distance = np.linalg.norm(positions[vertex] - place[vertex])
+        np.testing.assert_allclose(distance, np.sqrt(expected[0]), atol=2e-6)

@@ -1,6 +1,5 @@
 """Energies against HOOD's own values, finite differences, invariances and closed forms."""
 
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -8,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import contact, physics, proximity, rotation, topology
+from clothjax import contact, losses, physics, proximity, rotation, topology
+from clothjax.config import PhysicsConfig
+from clothjax.losses import TimeStep
+from clothjax.types import Contact, EdgeContact, Material, SelfContact
 
 DATA = Path(__file__).parent / "data"
 MU, LAM, STIFFNESS, DENSITY = 23600.0, 44400.0, 3.9625778333333325e-05, 0.20022  # HOOD's defaults
@@ -37,25 +39,46 @@ def sheet(n=5, size=0.3, seed=0):
     return canonical, canonical + 0.01 * random.standard_normal(canonical.shape), topology.mesh(faces)
 
 
-@partial(jax.jit, static_argnames="flat")
-def all_terms(posed, canonical, mesh, flat=False):
-    """Every energy of a posed sheet that hangs over a sphere, each summed."""
+TERMS = (
+    "stretching", "bending", "gravity", "inertia", "friction", "collision", "edge_collision", "self_collision"
+)  # fmt: skip
+
+
+def time_step(canonical, mesh, flat=False):
+    """A step of a sheet that hangs over a sphere and touches it and itself everywhere."""
     rest = physics.rest_measures(canonical, mesh, flat)
     mass = rest.vertex_area * DENSITY
-    centre = np.array([0.15, 0.15, -0.3])
-    normal = canonical - centre[None]
-    normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
-    slip = posed - canonical
-    stuck = np.arange(len(canonical)) % 3 > 0
-    distance = contact.distance(posed, canonical, normal)
-    return {
-        "stretching": jnp.sum(physics.stretching(posed[mesh.faces], rest.inverse, rest.face_area, MU, LAM)),
-        "bending": jnp.sum(physics.bending(posed[mesh.hinges], rest.hinge_area, rest.hinge_angle, STIFFNESS)),
-        "gravity": jnp.sum(physics.gravity(posed[:, 1], mass)),
-        "inertia": jnp.sum(physics.inertia(slip, mass, 1 / 30)),
-        "collision": jnp.sum(physics.collision(distance)),
-        "friction": jnp.sum(physics.friction(slip, normal, mass, stuck)),
-    }
+    centre = np.array([[0.15, 0.15, -0.3]])
+    random = np.random.default_rng(7)
+
+    def outwards(points):
+        return (points - centre) / np.linalg.norm(points - centre, axis=1, keepdims=True)
+
+    normal = outwards(canonical)
+    place = random.uniform(size=len(mesh.edges))
+    ends = canonical[mesh.edges]
+    middle = ends[:, 0] + place[:, None] * (ends[:, 1] - ends[:, 0])
+    corners = mesh.faces[(np.arange(len(canonical)) * 7 + 3) % len(mesh.faces)]
+    weights = random.dirichlet(np.ones(3), len(canonical))
+    across = canonical - np.einsum("vk,vkc->vc", weights, canonical[corners])
+    across = -across / (np.linalg.norm(across, axis=1, keepdims=True) + 1e-3)
+    return TimeStep(
+        position=canonical,
+        velocity=1e-3 * random.normal(size=canonical.shape),
+        mass=mass,
+        rest=rest,
+        material=Material(DENSITY, MU, LAM, STIFFNESS),
+        contact=Contact(canonical, canonical, normal, normal, np.zeros(len(canonical), np.int32)),
+        touching=np.arange(len(canonical)) % 3 > 0,
+        timestep=np.float64(1 / 30),
+        edge_contact=EdgeContact(place, middle, outwards(middle)),
+        self_contact=SelfContact(corners, weights, across),
+    )
+
+
+def all_terms(posed, canonical, mesh, flat=False):
+    """Every energy of the sheet, each summed."""
+    return losses.energies(posed, time_step(canonical, mesh, flat), mesh, PhysicsConfig())
 
 
 @pytest.mark.parametrize("roll", range(3))
@@ -103,16 +126,33 @@ def test_hood_friction_with_its_traps(hood, x64):
     np.testing.assert_allclose(jnp.sum(energy), expected, rtol=1e-10)
 
 
-@pytest.mark.parametrize("term", ["stretching", "bending", "gravity", "inertia", "collision", "friction"])
-def test_gradients_are_those_of_finite_differences(term, x64):
+def difference(function, x, direction, step):
+    """The derivative along a direction by central differences of fourth order (Richardson)."""
+
+    def central(h):
+        return (function(x + h * direction) - function(x - h * direction)) / (2 * h)
+
+    return (4 * central(step / 2) - central(step)) / 3
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_gradients_and_hessians_are_those_of_finite_differences(term, x64):
     canonical, posed, mesh = sheet()
-    value = jax.jit(lambda x: all_terms(x, canonical, mesh)[term])
-    gradient = np.asarray(jax.grad(value)(posed))
+    step = jax.tree.map(np.asarray, time_step(canonical, mesh))
+    value = jax.jit(lambda x: losses.energies(x, step, mesh, PhysicsConfig())[term])
+    gradient = jax.jit(jax.grad(value))
+    product = jax.jit(lambda x, d: jax.jvp(jax.grad(value), (x,), (d,))[1])
+    slope, scale = np.asarray(gradient(posed)), np.linalg.norm(gradient(posed))
+    assert scale > 0 and value(posed) != 0
     for seed in range(5):
         direction = np.random.default_rng(seed).standard_normal(posed.shape)
-        step = 1e-6
-        difference = (value(posed + step * direction) - value(posed - step * direction)) / (2 * step)
-        np.testing.assert_allclose(np.sum(gradient * direction), difference, rtol=1e-6)
+        direction /= np.linalg.norm(direction)
+        # 1e-7 of the gradient, and of the Hessian product
+        along = difference(value, posed, direction, 2e-5)
+        np.testing.assert_allclose(np.sum(slope * direction), along, atol=1e-7 * scale)
+        expected = np.asarray(difference(gradient, posed, direction, 2e-5))
+        found = np.asarray(product(posed, direction))
+        np.testing.assert_allclose(found, expected, atol=1e-7 * max(np.abs(found).max(), scale))
 
 
 def test_rigid_motion_leaves_elastic_energies(x64):
@@ -121,8 +161,48 @@ def test_rigid_motion_leaves_elastic_energies(x64):
     before = all_terms(posed, canonical, mesh)
     after = all_terms(posed @ turn.T + np.array([[3.0, -2.0, 1.0]]), canonical, mesh)
     for name in ("stretching", "bending"):
-        np.testing.assert_allclose(after[name], before[name], rtol=1e-10)
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-12)
     assert not np.isclose(after["gravity"], before["gravity"])
+
+
+def test_moving_everything_leaves_every_energy_and_turning_everything_all_but_gravity_and_friction(x64):
+    canonical, posed, mesh = sheet()
+    step = jax.tree.map(np.asarray, time_step(canonical, mesh))
+    turn = np.asarray(rotation.from_axis_angle(np.array([0.7, -1.1, 2.0])))
+    shift = np.array([[3.0, -2.0, 1.0]])
+
+    def moved(turn, shift):
+        def place(x):
+            return x @ turn.T + shift
+
+        def vector(x):
+            return x @ turn.T
+
+        return place(posed), step._replace(
+            position=place(step.position),
+            velocity=vector(step.velocity),
+            contact=step.contact._replace(
+                point=place(step.contact.point),
+                point_next=place(step.contact.point_next),
+                normal=vector(step.contact.normal),
+                normal_next=vector(step.contact.normal_next),
+            ),
+            edge_contact=step.edge_contact._replace(
+                point_next=place(step.edge_contact.point_next), normal_next=vector(step.edge_contact.normal_next)
+            ),
+            self_contact=step.self_contact._replace(normal=vector(step.self_contact.normal)),
+        )
+
+    before = losses.energies(posed, step, mesh, PhysicsConfig())
+    new, there = moved(np.eye(3), shift)
+    after = losses.energies(new, there, mesh, PhysicsConfig())
+    for name in TERMS:
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-12, atol=1e-12, err_msg=name)
+    new, there = moved(turn, shift)
+    after = losses.energies(new, there, mesh, PhysicsConfig())
+    for name in set(TERMS) - {"gravity", "friction"}:
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-12, atol=1e-12, err_msg=name)
+    assert not np.isclose(after["gravity"], before["gravity"]) and not np.isclose(after["friction"], before["friction"])
 
 
 def test_turning_about_the_vertical_leaves_friction_and_gravity(x64):
@@ -147,10 +227,35 @@ def test_renumbering_vertices_changes_nothing(x64):
     before = physics.rest_measures(canonical, mesh, flat=False)
     after = physics.rest_measures(canonical[old_of_new], renumbered, flat=False)
     np.testing.assert_allclose(after.vertex_area, before.vertex_area[old_of_new], rtol=1e-12)
-    expected = all_terms(posed, canonical, mesh)
-    found = all_terms(posed[old_of_new], canonical[old_of_new], renumbered)
-    for name in ("stretching", "bending"):
-        np.testing.assert_allclose(found[name], expected[name], rtol=1e-12)
+    step = jax.tree.map(np.asarray, time_step(canonical, mesh))
+    # the renumbered mesh may hold an edge the other way round, or elsewhere in its list
+    ends = {tuple(edge): index for index, edge in enumerate(mesh.edges.tolist())}
+    back = old_of_new[renumbered.edges]
+    where = np.array([ends[tuple(sorted(edge))] for edge in back.tolist()])
+    turned = back[:, 0] > back[:, 1]
+    place = step.edge_contact.place[where]
+    other = step._replace(
+        position=step.position[old_of_new],
+        velocity=step.velocity[old_of_new],
+        mass=step.mass[old_of_new],
+        rest=after,
+        contact=Contact(*(x[old_of_new] for x in step.contact)),
+        touching=step.touching[old_of_new],
+        edge_contact=EdgeContact(
+            np.where(turned, 1 - place, place),
+            step.edge_contact.point_next[where],
+            step.edge_contact.normal_next[where],
+        ),
+        self_contact=SelfContact(
+            new_of_old[step.self_contact.corners][old_of_new],
+            step.self_contact.weights[old_of_new],
+            step.self_contact.normal[old_of_new],
+        ),
+    )
+    expected = losses.energies(posed, step, mesh, PhysicsConfig())
+    found = losses.energies(posed[old_of_new], other, renumbered, PhysicsConfig())
+    for name in TERMS:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-12, err_msg=name)
 
 
 A, B, LEFT, RIGHT = np.eye(3)[0] * 0, np.eye(3)[0], np.eye(3)[1], -np.eye(3)[1]
@@ -282,6 +387,36 @@ def test_free_fall_is_the_minimum_of_gravity_and_inertia(x64):
 def test_collision_is_the_cube_of_the_penetration(x64):
     distance = np.array([-2e-3, 0.0, 2.999e-3, 3e-3, 1.0])
     np.testing.assert_allclose(physics.collision(distance), [1.25e-7, 2.7e-8, 1e-18, 0.0, 0.0], rtol=1e-6, atol=1e-30)
+
+
+def test_an_edge_collides_where_it_touches(x64):
+    """A bar across a ridge: its place 4 mm deep, in closed form."""
+    ends = np.array([[-0.1, 0.05, 0.0], [0.3, -0.03, 0.0]])
+    place = np.array(0.25)
+    up, ridge = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.031, 0.2])
+    touched = EdgeContact(place, ridge, up)
+    config = PhysicsConfig()
+    depth = config.collision_offset - (0.75 * 0.05 - 0.25 * 0.03 - 0.031)
+    energy = losses.edge_collision(ends, touched, config)
+    np.testing.assert_allclose(energy, config.collision_stiffness * depth**3, rtol=1e-12)
+    # three quarters of the push at the near end, along the normal
+    gradient = jax.grad(losses.edge_collision)(ends, touched, config)
+    slope = -3 * config.collision_stiffness * depth**2
+    np.testing.assert_allclose(gradient, [slope * 0.75 * up, slope * 0.25 * up], rtol=1e-12)
+
+
+def test_a_vertex_keeps_its_distance_from_a_triangle(x64):
+    config = PhysicsConfig(self_offset=2e-3)
+    points = np.array([[0.01, 5e-4, 0.01], [0, 0, 0], [0.04, 0, 0], [0, 0, 0.04]])
+    weights = np.array([0.5, 0.25, 0.25])
+    touched = SelfContact(np.arange(1, 4), weights, np.array([0.0, 1, 0]))
+    np.testing.assert_allclose(losses.self_collision(points, touched, config), 1e5 * 1.5e-3**3, rtol=1e-12)
+    gradient = np.asarray(jax.grad(losses.self_collision)(points, touched, config))
+    push = 3 * 1e5 * 1.5e-3**2
+    np.testing.assert_allclose(gradient[:, 1], push * np.array([-1, 0.5, 0.25, 0.25]), rtol=1e-12)
+    np.testing.assert_allclose(gradient.sum(axis=0), 0.0, atol=1e-12)  # what one pushes, the other feels
+    apart = points + np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    assert losses.self_collision(apart, touched, config) == 0
 
 
 def test_rest_measures_are_those_of_numpy(x64):

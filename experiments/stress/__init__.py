@@ -1,0 +1,1 @@
+"""The three layers of the stress test: the energies, the reference solver, a trained run in closed loop."""
