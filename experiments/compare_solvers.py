@@ -2,6 +2,7 @@
 
     python -m experiments.compare_solvers --png runs/solvers.png       # needs: pip install clothjax[compare,render]
     python -m experiments.compare_solvers --scenes edge --substeps 1 2 4 8 --json runs/solvers.json
+    python -m experiments.compare_solvers --scenes hang sphere --iterations 4000   # so many that Newton has converged
 
 A square sheet hangs from one edge until it is at rest (`hang`), falls from level held by one edge (`edge`) or by two
 corners (`corners`), or drops without friction on a sphere (`sphere`). Both are implicit Euler, whose damping depends
