@@ -26,7 +26,7 @@ lint: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml uv.lock
 	@export UV_PROJECT_ENVIRONMENT=$(VENV) UV_PYTHON_DOWNLOADS=never
-	if ! { command -v uv >/dev/null && uv sync --frozen --all-extras; }; then
+	if ! { command -v uv >/dev/null && uv sync --frozen --all-extras --no-extra compare; }; then
 	    echo "uv is not there or did not succeed: installing with pip"
 	    made=
 	    for python in $(CANDIDATES); do

@@ -193,7 +193,7 @@ def test_a_flat_body_touches_an_edge_in_its_middle_also_where_they_are_parallel(
         planes = contact.find(positions, vertices, vertices, patches)
         found = contact.find_at_edges(positions, planes, mesh, vertices, vertices, patches)
         edge = [tuple(e) for e in mesh.edges.tolist()].index((0, 1))
-        # 1e-8 m of rounding tilt a normal over 2 mm, which the length of 10 cm makes 1e-6 m of the 1e-4 m that are level
+        # 1e-8 m of rounding tilt a normal over 2 mm, which 10 cm of length make 1e-6 m of the 1e-4 m that are level
         np.testing.assert_allclose(found.place[edge], 0.5, atol=0.05)
         np.testing.assert_allclose(found.normal_next[edge], [0, 1, 0], atol=1e-5)
 
