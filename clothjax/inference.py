@@ -1,9 +1,9 @@
 """Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
 
 A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
-`latent_predictor.MARGIN` times the range that they had in training, and a pose that is not finite is taken to be the
-last one: whatever comes in, the garment stays finite and plausible, and when the input is ordinary again the code
-forgets the rest within a second. `State.ok` tells of every frame whether nothing of this was needed.
+the range that they had in training, and a pose that is not finite is taken to be the last one: whatever comes in, the
+garment stays finite, and when the input is ordinary again the code forgets the rest within a second or two. `State.ok`
+tells of every frame whether nothing of this was needed.
 """
 
 import dataclasses
@@ -144,7 +144,8 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
     )
     scales = model.normalizers
     inputs = latent_predictor.normalise(scales.pose, inputs)
-    inputs, ordinary = latent_predictor.bounded(inputs, scales.pose.low, scales.pose.high)
+    slack = latent_predictor.SLACK / scales.pose.deviation
+    inputs, ordinary = latent_predictor.bounded(inputs, scales.pose.low, scales.pose.high, slack)
     constants, known = latent_predictor.bounded_constants(model.constants, model.config)
     latent = latent_predictor.predict(
         model.predictor, state.latent, inputs, constants, model.config.stage2.latent_decay

@@ -11,8 +11,7 @@ from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.graph_network import Params, init_mlp, mlp
 from clothjax.types import Array, Material
 
-MARGIN = 1.2  # times the range seen in training, beyond which the predictor is not asked
-ROUNDING = 1e-3  # standard deviations
+SLACK = 0.02  # m/s, m or of a rotation matrix: what an input may be out of its range without being worth a word
 
 
 class Scale(NamedTuple):
@@ -67,7 +66,7 @@ def constant_inputs(betas: Array, material: Material, config: MaterialConfig) ->
 
 
 def bounded_constants(constants: Array, config: Config) -> tuple[Array, Array]:
-    """Constants [S + 4] brought into `MARGIN` times the range of training, and whether they were there."""
+    """Constants [S + 4] brought into the range that they are drawn from in training, and whether they were there."""
     count = constants.shape[0] - len(Material._fields)
     betas = jnp.full(count, config.stage1.betas)
     materials = jnp.ones(len(Material._fields))
@@ -98,12 +97,10 @@ def denormalise(scale: Scale, row: Array) -> Array:
     return row * scale.deviation + scale.mean
 
 
-def bounded(row: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """A row [N] brought into `MARGIN` times the range [low, high], and whether it was there."""
-    middle, half = 0.5 * (high + low), 0.5 * (high - low)
-    reach = MARGIN * half + ROUNDING
-    inside = jnp.clip(row, middle - reach, middle + reach)
-    return inside, jnp.all(inside == row)
+def bounded(row: Array, low: Array, high: Array, slack: Array | float = 0.1) -> tuple[Array, Array]:
+    """A row [N] brought into the range [low, high], and whether it was there but for `slack`."""
+    inside = jnp.clip(row, low, high)
+    return inside, jnp.all(jnp.abs(inside - row) <= slack)
 
 
 def measure(rows: np.ndarray) -> Scale:

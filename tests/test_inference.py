@@ -27,6 +27,10 @@ def trained():
         config, whole.garment, whole.body, whole.names, second.garment, second.params, second.normalizers,
         betas=np.linspace(-1, 1, 10),
     )  # fmt: skip
+    # twelve frames of a teacher span next to nothing: as if it had seen more
+    wide = {name: scale._replace(low=0 * scale.low - 1e6, high=0 * scale.high + 1e6) for name, scale in
+            second.normalizers._asdict().items()}  # fmt: skip
+    model = dataclasses.replace(model, normalizers=latent_predictor.Normalizers(**wide))
     clip = experiment.motion(whole, "walk_3")
     return model, Motion(clip.rotations[:30], clip.translation[:30].astype(np.float32), clip.fps), teacher
 
@@ -83,7 +87,62 @@ def test_the_state_says_nothing_of_the_frames_before_the_last_two(trained):
     state = inference.initial_state(model, pose)
     size = sum(x.size for x in state)
     joints = motion.rotations.shape[1]
-    assert size == state.latent.size + 2 * (9 * joints + 3)
+    assert size == state.latent.size + 2 * (9 * joints + 3) + 1
+
+
+def test_a_frame_that_is_not_finite_is_the_last_one_again(trained):
+    model, motion, _ = trained
+    for broken in (motion.rotations, motion.translation):
+        wrong = np.array(broken)
+        wrong[10].flat[3 % wrong[10].size] = np.nan
+        held = [np.array(x) for x in motion[:2]]
+        held[0][10], held[1][10] = held[0][9], held[1][9]
+        parts = (wrong, motion.translation) if broken is motion.rotations else (motion.rotations, wrong)
+        # only what is broken is replaced by the whole last pose
+        vertices, ok = inference.animate(model, Motion(*parts, motion.fps))
+        expected, fine = inference.animate(model, Motion(*held, motion.fps))
+        np.testing.assert_array_equal(vertices, expected)
+        assert not ok[10] and (np.asarray(ok) == np.asarray(fine))[np.arange(30) != 10].all()
+
+
+def test_a_first_frame_that_is_not_finite_is_the_canonical_pose(trained):
+    model, motion, _ = trained
+    rotations = np.array(motion.rotations)
+    rotations[0] = np.inf
+    state = inference.initial_state(model, Pose(rotations[0], motion.translation[0]))
+    np.testing.assert_array_equal(state.rotations[0], np.broadcast_to(np.eye(3), rotations[0].shape))
+    assert not state.ok
+    vertices, ok = inference.animate(model, Motion(rotations, motion.translation, motion.fps))
+    assert np.isfinite(vertices).all() and not ok[0]
+
+
+def test_what_training_has_not_seen_is_said_and_leaves_the_code_where_training_had_it(trained):
+    model, motion, _ = trained
+    assert inference.animate(model, motion)[1].all()
+    fast = motion._replace(translation=motion.translation * np.float32(1e9))
+    assert not inference.animate(model, fast)[1][2:].any()
+    latent = model.normalizers.latent
+    strict = latent._replace(low=0 * latent.low - 0.5, high=0 * latent.high + 0.5)
+    narrow = dataclasses.replace(model, normalizers=model.normalizers._replace(latent=strict))
+    state = inference.initial_state(narrow, Pose(motion.rotations[0], motion.translation[0]))
+    told = []
+    for rotations, translation in zip(motion.rotations, motion.translation):
+        state, vertices = inference.step(narrow, state, Pose(jnp.asarray(rotations), jnp.asarray(translation)))
+        told.append(bool(state.ok))
+        assert np.isfinite(vertices).all() and float(jnp.abs(state.latent).max()) <= 0.5
+    assert not all(told)
+
+
+def test_a_wearer_or_a_cloth_outside_the_range_of_training_is_said(trained):
+    model, motion, _ = trained
+    limit = model.config.stage1.betas
+    for constants, fine in (
+        (model.constants.at[0].set(limit), True),
+        (model.constants.at[0].set(1.5 * limit), False),
+        (model.constants.at[-1].set(1.0), True),
+        (model.constants.at[-1].set(-0.5), False),
+    ):
+        assert bool(inference.animate(dataclasses.replace(model, constants=constants), motion)[1].all()) == fine
 
 
 def test_wrong_betas_are_refused(trained):
