@@ -42,7 +42,7 @@ def step_measures(
         frames: from 1 to T - 1.
     """
 
-    state = simulation.problem(scene, character, config)
+    state = simulation.problem(scene, config)
 
     def energy(new: Array, step: TimeStep) -> float:
         # float64 on the host, as the solver has it: differences of energies are small
@@ -52,9 +52,8 @@ def step_measures(
 
     measures = []
     for frame in frames:
-        step, skinned, held, advance = state(
-            trajectory[frame - 1], trajectory[frame], jax.tree.map(lambda x, t=frame: x[t], poses)
-        )
+        around = jax.tree.map(lambda x, t=frame: x[t], poses)
+        step, skinned, held, advance = state(character, trajectory[frame - 1], trajectory[frame], around)
         new = trajectory[frame + 1] + advance[None]
         taken, kept = energy(new, step), energy(held, step)
         # two starts, the better end: folds have many minima

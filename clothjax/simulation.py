@@ -26,15 +26,15 @@ class Problem(NamedTuple):
     advance: Array  # [3] m, of the root
 
 
-def problem(scene: Scene, character: Character, config: Config) -> Callable[[Array, Array, Pose], Problem]:
+def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, Pose], Problem]:
     """A jitted function that states a time step.
 
-    Its arguments are the garment [V, 3] m at the last frame and at this one, each relative to the root then, and the
-    three poses around the step.
+    Its arguments are the wearer, the garment [V, 3] m at the last frame and at this one, each relative to the root
+    then, and the three poses around the step.
     """
 
     @jax.jit
-    def state(before: Array, now: Array, poses: Pose) -> Problem:
+    def state(character: Character, before: Array, now: Array, poses: Pose) -> Problem:
         window = characters.window(scene, character, poses)
         velocity = now - (before + poses.translation[0][None])
         cloth = ClothState(now, velocity, jnp.zeros_like(now), jnp.zeros(0, now.dtype))
@@ -67,7 +67,7 @@ def simulate(
         progress: called with the number of frames done.
     """
     garment, infos = scene.garment, []
-    state = problem(scene, character, config)
+    state = problem(scene, config)
 
     def solve(guess: Array, step: TimeStep) -> np.ndarray:
         new, info = solver.solve_step(guess, step, scene.mesh, garment.pinned, config.physics)
@@ -82,7 +82,7 @@ def simulate(
         before, now = (np.asarray(x, np.float32) for x in start)
     trajectory = [now]
     for frame in range(poses.translation.shape[0]):
-        step, _, held, advance = state(before, now, _at(poses, frame))
+        step, _, held, advance = state(character, before, now, _at(poses, frame))
         before, now = now, solve(held, step) - np.asarray(advance)[None]
         trajectory.append(now)
         progress(len(trajectory))

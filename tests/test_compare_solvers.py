@@ -9,7 +9,8 @@ import pytest
 
 from clothjax import physics
 from experiments import compare_solvers as compare
-from experiments.compare_solvers import CONFIG, MATERIAL, SCENES
+from experiments import engines
+from experiments.engines import CONFIG, MATERIAL, SCENES
 
 DT = 1 / 120
 
@@ -25,7 +26,7 @@ def stretching(law, strain):
 
 
 def test_newtons_membrane_is_ours_to_second_order():
-    ours, newtons = physics.stretching, compare.neo_hookean
+    ours, newtons = physics.stretching, engines.neo_hookean
     with jax.enable_x64(True):
         zero = jnp.zeros((2, 2))
         assert abs(stretching(newtons, zero)) < 1e-15
@@ -38,12 +39,12 @@ def test_newtons_membrane_is_ours_to_second_order():
 
 
 def test_contacts_are_as_deep_under_a_vertex():
-    weight = physics.GRAVITY * MATERIAL.density * compare.SIZE**2 / 100
+    weight = physics.GRAVITY * MATERIAL.density * engines.SIZE**2 / 100
     depth = np.sqrt(weight / (3 * CONFIG.collision_stiffness))
-    assert compare.contact_stiffness(100) * depth == pytest.approx(weight)
+    assert engines.contact_stiffness(100) * depth == pytest.approx(weight)
     with jax.enable_x64(True):
         distance = jnp.full(100, CONFIG.collision_offset - depth)
-        force = -CONFIG.collision_stiffness * jax.grad(lambda d: compare.quadratic(d, CONFIG.collision_offset).sum())(
+        force = -CONFIG.collision_stiffness * jax.grad(lambda d: engines.quadratic(d, CONFIG.collision_offset).sum())(
             distance
         )
     np.testing.assert_allclose(force, weight)
@@ -51,26 +52,26 @@ def test_contacts_are_as_deep_under_a_vertex():
 
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes(name):
-    scene = compare.scene(name, 6)
+    scene = engines.scene(name, 6)
     assert len(scene.flat) == 36 and len(scene.mesh.faces) == 50
     assert scene.pinned.sum() == {"hang": 6, "edge": 6, "corners": 2, "sphere": 0}[name]
-    step = compare.Reference(scene, DT).time_step()
+    step = engines.Reference(scene, DT).time_step()
     terms = compare.energies(scene, scene.start)
     assert terms["stretching"] < 1e-12 and terms["gravity"] == terms["collision"] == 0
-    np.testing.assert_allclose(step.mass.sum(), MATERIAL.density * compare.SIZE**2, rtol=1e-6)
+    np.testing.assert_allclose(step.mass.sum(), MATERIAL.density * engines.SIZE**2, rtol=1e-6)
 
 
 def test_the_plane_of_a_vertex_touches_the_sphere():
-    scene = compare.scene("sphere", 6)
-    contact = compare.Reference(scene, DT).time_step().contact
-    np.testing.assert_allclose(np.linalg.norm(contact.point - scene.centre, axis=1), compare.SPHERE)
+    scene = engines.scene("sphere", 6)
+    contact = engines.Reference(scene, DT).time_step().contact
+    np.testing.assert_allclose(np.linalg.norm(contact.point - scene.centre, axis=1), engines.SPHERE)
     gap = np.sum((scene.start - contact.point) * contact.normal, axis=1)
-    np.testing.assert_allclose(gap, np.linalg.norm(scene.start - scene.centre, axis=1) - compare.SPHERE)
+    np.testing.assert_allclose(gap, np.linalg.norm(scene.start - scene.centre, axis=1) - engines.SPHERE)
 
 
 def test_our_pins_carry_the_weight_at_rest():
-    scene = compare.scene("hang", 6)
-    engine = compare.Reference(scene, 1e3)  # a step so long that there is no inertia
+    scene = engines.scene("hang", 6)
+    engine = engines.Reference(scene, 1e3)  # a step so long that there is no inertia
     engine.advance()
     assert engine.converged
     assert compare.pins(scene, engine.position) == pytest.approx(1, abs=1e-5)
@@ -78,8 +79,8 @@ def test_our_pins_carry_the_weight_at_rest():
 
 def test_newtons_energies_are_put_back():
     ours = physics.stretching, physics.collision
-    with compare.newtons_energies():
-        assert physics.stretching is compare.neo_hookean and physics.collision is compare.quadratic
+    with engines.newtons_energies():
+        assert physics.stretching is engines.neo_hookean and physics.collision is engines.quadratic
     assert (physics.stretching, physics.collision) == ours
 
 
@@ -95,7 +96,7 @@ def test_distances():
 def test_without_newton_it_says_so(monkeypatch):
     monkeypatch.setitem(sys.modules, "newton", None)
     with pytest.raises(ImportError, match=r"clothjax\[compare\]"):
-        compare.Vbd(compare.scene("edge", 4), DT, 1)
+        engines.Vbd(engines.scene("edge", 4), DT, 1)
 
 
 @pytest.mark.parametrize("name", ["corners", "sphere"])
@@ -106,9 +107,9 @@ def test_ours_and_newtons_take_the_same_steps(name):
     makes it tens of times larger.
     """
     pytest.importorskip("newton")
-    scene = compare.scene(name, 8)
-    engines = {"newton": compare.Vbd(scene, DT, 100)}
-    with compare.newtons_energies():
-        tracks, _ = compare.simulate({"ours": compare.Reference(scene, DT), **engines}, 4, 4)
+    scene = engines.scene(name, 8)
+    newton = engines.Vbd(scene, DT, 100)
+    with engines.newtons_energies():
+        tracks, _ = compare.simulate({"ours": engines.Reference(scene, DT), "newton": newton}, 4, 4)
     assert np.abs(tracks["ours"][-1] - scene.start).max() > 0.03
     assert compare.distances(tracks["ours"], tracks["newton"])["max_mm"] < 0.05

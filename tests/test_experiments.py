@@ -7,7 +7,8 @@ from PIL import Image
 from clothjax import clips, experiment, features, scene
 from clothjax.config import Config
 from clothjax.types import Motion
-from experiments import evaluate, quickstart, render, train
+from experiments import evaluate, quickstart, render, stability, train
+from experiments.stress import closed_loop
 
 TOY = [
     "--stage1.steps", "60", "--stage1.pool", "4", "--stage2.steps", "40", "--stage2.sequences", "4",
@@ -128,3 +129,20 @@ def test_statistics_are_those_of_all_rows_seen():
     np.testing.assert_allclose(statistics.variance, rows.var(0), rtol=1e-4)
     frozen = features.observe(statistics, 100 * batches[0], 5)
     np.testing.assert_array_equal(frozen.mean, statistics.mean)
+
+
+def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
+    """Its two-minute version, with the closed loops of a run that was hardly trained: they need not be good."""
+    monkeypatch.setattr(stability.solver, "stress", lambda *_: {})  # has tests of its own
+    monkeypatch.setattr(closed_loop, "AFTER", 20)
+    stability.main([str(finished), "--quick", "--json", str(tmp_path / "s.json")])
+    report = json.loads((tmp_path / "s.json").read_text())
+    assert report["physics"]["configurations"] == 9000 and report["physics"]["nonfinite"] == 0
+    assert report["float32"]["energy_error"] <= 1e-5 and report["float32"]["gradient_error"] <= 1e-4
+    assert report["solver"]["walk_1000"]["converged"] == 1 and report["solver"]["seconds_per_frame_1000"] > 0
+    assert report["closed_loop"]["nonfinite"] == 0 and report["closed_loop"]["frames"] > 3000
+    assert set(report["closed_loop"]["recovery"]) == {"teleport", "NaN frame", "half-turn"}
+    # a teacher of a few frames knows next to nothing, and so says Psi
+    assert report["closed_loop"]["loops"]["long"]["flagged"] > 0
+    assert "| long | 1000 | 0 |" in capsys.readouterr().out
+    assert Image.open(tmp_path / "s.png").width > 500

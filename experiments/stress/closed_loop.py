@@ -186,10 +186,10 @@ def energies_of(whole: Experiment, character: Character, track: np.ndarray, pose
 
     All terms but gravity, whose zero is anywhere.
     """
-    state = simulation.problem(whole.scene, character, whole.config)
+    state = simulation.problem(whole.scene, whole.config)
 
     def energy(before, now, after, poses):
-        step, _, _, advance = state(before, now, poses)
+        step, _, _, advance = state(character, before, now, poses)
         terms = losses.energies(after + advance[None], step, whole.scene.mesh, whole.config.physics)
         return sum(value for name, value in terms.items() if name != "gravity")
 
