@@ -14,7 +14,8 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> C
     """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
 
     The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
-    2005). Plane and point go with their triangle to the next frame.
+    2005). Where the body ends, as where it was cut, the surface is taken to go on. Plane and point go with their
+    triangle to the next frame.
 
     Args:
         body, body_next: [B, 3] m at this frame and the next.
@@ -29,13 +30,13 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> C
 
     offset = positions - point
     apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
-    pseudonormal = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
+    pseudonormal, border = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
     side = jnp.where(jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    on_surface = apart < ON_SURFACE**2
+    on_surface = (apart < ON_SURFACE**2) | border[:, None]
     normal = jnp.where(on_surface, pseudonormal, side * offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     local = jnp.einsum("vca,vc->va", _axes(here), normal, precision="highest")
     turned = jnp.einsum("vca,va->vc", _axes(there), local, precision="highest")
-    lost = jnp.sum(turned * turned, axis=-1, keepdims=True) < 0.5  # a triangle without area has no axes
+    lost = jnp.sum(turned * turned, axis=-1, keepdims=True) < 0.99  # a triangle without area has no axes
     turned = jnp.where(lost, normal, turned)
     return Contact(point, point_next, normal, turned, faces[face, jnp.argmax(weights, axis=1)])
 
@@ -99,17 +100,19 @@ def distance(positions: Array, points: Array, normals: Array) -> Array:
     return jnp.sum((positions - points) * normals, axis=-1)
 
 
-def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> Array:
-    """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on."""
+def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
+    """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on; if it is a border."""
     normals = _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = patches.faces
     weighted = _angles(corners)[:, :, None] * normals[:, None]
     around = jnp.zeros_like(body).at[faces.reshape(-1)].add(weighted.reshape(-1, 3))
     zero = weights <= 1e-6
     count = jnp.sum(zero, axis=1)[:, None]
-    edge = normals[face] + normals[patches.across[face, jnp.argmax(zero, axis=1)]]
-    vertex = around[faces[face, jnp.argmax(weights, axis=1)]]
-    return _unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, vertex)))
+    across = patches.across[face, jnp.argmax(zero, axis=1)]
+    corner = faces[face, jnp.argmax(weights, axis=1)]
+    border = jnp.where(count[:, 0] == 1, across == face, (count[:, 0] > 1) & patches.border[corner])
+    edge = normals[face] + normals[across]
+    return _unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
 
 
 def _angles(corners: Array) -> Array:

@@ -1,9 +1,9 @@
 """Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
 
 A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
-the range that they had in training, and a pose that is not finite is taken to be the last one: whatever comes in, the
-garment stays finite, and when the input is ordinary again the code forgets the rest within a second or two. `State.ok`
-tells of every frame whether nothing of this was needed.
+the range that they had in training, and a pose that is not finite, or no pose at all, is taken to be the last one:
+whatever comes in, the garment stays finite, and when the input is ordinary again the code forgets the rest within a
+second or two. `State.ok` tells of every frame whether nothing of this was needed.
 """
 
 import dataclasses
@@ -19,6 +19,8 @@ from clothjax import checkpoint, configuration, garment_model, latent_predictor,
 from clothjax.config import Config
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import Array, Body, Garment, Material, Motion, Pose
+
+FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
 
 
 @partial(
@@ -113,19 +115,20 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
 def initial_state(model: Model, pose: Pose) -> State:
     """The state before the first frame: the code is zero and the character has been standing in `pose`.
 
-    Of a pose that is not finite, the canonical one takes the place.
+    The canonical pose takes the place of one that is not finite.
     """
     size = model.normalizers.latent.mean.shape[0]
     zero = latent_predictor.normalise(model.normalizers.latent, jnp.zeros(size))
     pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
     still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
-    pose, ok = _finite_or(pose, still)
+    pose, ok = _sound_or(pose, still)
     return State(zero, *(jnp.stack([x, x]) for x in pose), ok)
 
 
-def _finite_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
-    finite = jnp.all(jnp.isfinite(pose.rotations)) & jnp.all(jnp.isfinite(pose.translation))
-    return jax.tree.map(lambda x, y: jnp.where(finite, x, y), pose, other), finite
+def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
+    # NaN is not less than anything
+    sound = jnp.all(jnp.abs(pose.rotations) < 2.0) & jnp.all(jnp.abs(pose.translation) < FARTHEST)
+    return jax.tree.map(lambda x, y: jnp.where(sound, x, y), pose, other), sound
 
 
 @jax.jit
@@ -136,7 +139,7 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
     """
     parents = np.array(model.parents)
-    pose, finite = _finite_or(pose, Pose(state.rotations[0], state.translation[0]))
+    pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
     rotations = jnp.concatenate([pose.rotations[None], state.rotations])
     advance = jnp.stack([pose.translation - state.translation[0], state.translation[0] - state.translation[1]])
     inputs = latent_predictor.pose_inputs(
@@ -158,7 +161,7 @@ def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
     vertices = garment_model.vertices(
         displaced, model.garment.vertices, skinning.blend(model.garment.weights, transforms)
     )
-    ok = finite & ordinary & known & bounded
+    ok = sound & ordinary & known & bounded
     following = State(latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]]), ok)
     return following, vertices + pose.translation[None]
 

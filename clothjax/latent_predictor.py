@@ -98,8 +98,8 @@ def denormalise(scale: Scale, row: Array) -> Array:
 
 
 def bounded(row: Array, low: Array, high: Array, slack: Array | float = 0.1) -> tuple[Array, Array]:
-    """A row [N] brought into the range [low, high], and whether it was there but for `slack`."""
-    inside = jnp.clip(row, low, high)
+    """A row [N] brought into the range [low, high], NaN to its middle, and whether it was there but for `slack`."""
+    inside = jnp.where(jnp.isnan(row), 0.5 * (low + high), jnp.clip(row, low, high))
     return inside, jnp.all(jnp.abs(inside - row) <= slack)
 
 

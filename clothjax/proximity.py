@@ -1,5 +1,6 @@
 """What is nearest: the point of a cloud, the triangle of a mesh, the place on a triangle."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ class Patches(NamedTuple):
 
     faces: Array  # [F, 3] int32
     across: Array  # [F, 3] int32, the face across the edge opposite a corner; itself where there is none
+    border: Array  # [B] bool, vertices of an edge that only one face has
     groups: Array  # [G, PATCH] int32, every face; the last of a group is repeated
 
 
@@ -30,6 +32,9 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
     start, end = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
     other = {pair: index // 3 for index, pair in enumerate(zip(start.tolist(), end.tolist()))}
     across = [other.get(pair, index // 3) for index, pair in enumerate(zip(end.tolist(), start.tolist()))]
+    open_edge = np.array([pair not in other for pair in zip(end.tolist(), start.tolist())])
+    border = np.zeros(len(vertices), bool)
+    border[np.concatenate([start[open_edge], end[open_edge]])] = True
     centroids = np.asarray(vertices)[faces].mean(axis=1)
 
     def halve(members: np.ndarray) -> list[np.ndarray]:
@@ -41,7 +46,8 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
         return halve(ordered[:half]) + halve(ordered[half:])
 
     groups = np.stack(halve(np.arange(len(faces))))
-    return Patches(faces.astype(np.int32), np.reshape(across, (-1, 3)).astype(np.int32), groups.astype(np.int32))
+    across = np.reshape(across, (-1, 3)).astype(np.int32)
+    return Patches(faces.astype(np.int32), across, border, groups.astype(np.int32))
 
 
 def nearest_point(positions: Array, points: Array) -> Array:
@@ -76,35 +82,48 @@ def closest_on_triangle(positions: Array, corners: Array) -> tuple[Array, Array]
 
     Triangles without area are the segments they have shrunk to.
     """
-    origin, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-    b, c, p = b - origin, c - origin, positions - origin
-    v, w, squared = _closest(*(jnp.sum(x * y, axis=-1) for x, y in ((b, b), (b, c), (c, c), (b, p), (c, p), (p, p))))
+    origin = corners[..., 0, :]
+    b, c, p = (jnp.moveaxis(x - origin, -1, 0) for x in (corners[..., 1, :], corners[..., 2, :], positions))
+    v, w, squared = _closest(b, c, p)
     return jnp.stack([1.0 - v - w, v, w], axis=-1), squared
 
 
-def _closest(bb: Array, bc: Array, cc: Array, bp: Array, cp: Array, pp: Array) -> tuple[Array, Array, Array]:
-    """(v, w) of the point v b + w c of the triangle (0, b, c) nearest to p, and |p - v b - w c|^2, from products."""
-    determinant = bb * cc - bc * bc
-    flat = determinant <= 0
-    safe = jnp.where(flat, 1.0, determinant)
-    v, w = (cc * bp - bc * cp) / safe, (bb * cp - bc * bp) / safe
-    inside = ~flat & (v >= 0) & (w >= 0) & (v + w <= 1)
+def _closest(b: Sequence[Array], c: Sequence[Array], p: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """(v, w) of the point v b + w c of the triangle (0, b, c) nearest to p, and |p - v b - w c|^2.
+
+    Vectors are given by their coordinates, so that nothing has an axis of three.
+    """
+
+    def dot(x, y):
+        return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+    def cross(x, y):
+        return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
 
     def along(product, squared):
         return jnp.clip(product / jnp.where(squared > 0, squared, 1.0), 0.0, 1.0)
 
-    def away(v, w):
-        # |v b + w c - p|^2 - |p|^2
-        return v * (v * bb + 2.0 * w * bc - 2.0 * bp) + w * (w * cc - 2.0 * cp)
+    def apart(v, w):
+        # not by products: they cancel near the triangle
+        offset = [p[i] - v * b[i] - w * c[i] for i in range(3)]
+        return dot(offset, offset)
 
+    bb, bc, cc, bp, cp = dot(b, b), dot(b, c), dot(c, c), dot(b, p), dot(c, p)
+    # by the normal: bb cc - bc^2, the same squared, has lost twice the digits on a sliver
+    normal = cross(b, c)
+    squared = dot(normal, normal)
+    flat = squared <= 0
+    safe = jnp.where(flat, 1.0, squared)
+    v, w = dot(cross(p, c), normal) / safe, dot(cross(b, p), normal) / safe
+    inside = ~flat & (v >= 0) & (w >= 0) & (v + w <= 1)
+    best = jnp.where(inside, apart(v, w), jnp.inf)  # of a sliver, an edge may be nearer: its inside is rounding
     zero = jnp.zeros_like(v)
     third = along(cp - bp + bb - bc, bb - 2.0 * bc + cc)
-    best = jnp.where(inside, -jnp.inf, jnp.inf)
     for side_v, side_w in ((along(bp, bb), zero), (zero, along(cp, cc)), (1.0 - third, third)):
-        distance = away(side_v, side_w)
-        better = distance < best
-        v, w, best = jnp.where(better, side_v, v), jnp.where(better, side_w, w), jnp.where(better, distance, best)
-    return v, w, pp + away(v, w)
+        squared = apart(side_v, side_w)
+        better = squared < best
+        v, w, best = jnp.where(better, side_v, v), jnp.where(better, side_w, w), jnp.where(better, squared, best)
+    return v, w, best
 
 
 def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array | None = None) -> Array:
@@ -125,8 +144,7 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
     # one coordinate after the other, so that a patch's triangles lie side by side
     origin = grouped[:, :, 0]
     b, c = grouped[:, :, 1] - origin, grouped[:, :, 2] - origin
-    products = jnp.stack([jnp.sum(x * y, axis=-1) for x, y in ((b, b), (b, c), (c, c))], axis=1)
-    table = jnp.concatenate([*(jnp.swapaxes(x, 1, 2) for x in (origin, b, c)), products], axis=1)  # [G, 12, PATCH]
+    table = jnp.concatenate([jnp.swapaxes(x, 1, 2) for x in (origin, b, c)], axis=1)  # [G, 9, PATCH]
 
     def beyond(axis):
         place = positions[:, None, axis]
@@ -149,11 +167,8 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
         group = jnp.minimum(key & bits, last_group)
         found = table[group]
         offset = [position[:, i, None] - found[:, i] for i in range(3)]
-        bp, cp, pp = (
-            other[0] * offset[0] + other[1] * offset[1] + other[2] * offset[2]
-            for other in ([found[:, 3 + i] for i in range(3)], [found[:, 6 + i] for i in range(3)], offset)
-        )
-        squared = _closest(found[:, 9], found[:, 10], found[:, 11], bp, cp, pp)[2]
+        b, c = ([found[:, first + i] for i in range(3)] for first in (3, 6))
+        _, _, squared = _closest(b, c, offset)
         if apart is not None:
             own = jnp.any(jnp.asarray(apart)[groups[group]] == number[:, None, None], axis=-1)
             squared = jnp.where(own, jnp.inf, squared)

@@ -44,7 +44,7 @@ class SolverInfo(NamedTuple):
     relative_gradient: float  # gradient_norm over the norm of the free vertices' weights
     energy: float  # J
     stretch: float  # the largest of a face in any direction, 1 at rest
-    depth: float  # m, of the vertex that is farthest behind the surface that it may touch
+    depth: float  # m, of the free vertex that is farthest behind the surface that it may touch
 
     @property
     def ok(self) -> bool:
@@ -137,7 +137,7 @@ def solve_step(
             x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
             if not moved:
                 break
-        stretch, depth = (float(value) for value in _condition(x, step, mesh))
+        stretch, depth = (float(value) for value in _condition(x, step, mesh, free[:, 0]))
     norm = float(np.linalg.norm(gradient))
     return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy, stretch, depth)
 
@@ -263,13 +263,15 @@ def _value_and_gradient(x, step, mesh, config):
 
 
 @jax.jit
-def _condition(x: Array, step: TimeStep, mesh: Mesh) -> tuple[Array, Array]:
-    """The largest stretch of a face and the deepest vertex in m."""
+def _condition(x: Array, step: TimeStep, mesh: Mesh, free: Array) -> tuple[Array, Array]:
+    """The largest stretch of a face, and the depth in m of the deepest free vertex."""
     strain = physics.green_strain(x[mesh.faces], step.rest.inverse)
     mean, spread = 0.5 * (strain[:, 0, 0] + strain[:, 1, 1]), 0.5 * (strain[:, 0, 0] - strain[:, 1, 1])
     largest = mean + jnp.sqrt(spread * spread + strain[:, 0, 1] * strain[:, 0, 1])
     distance = contact.distance(x, step.contact.point_next, step.contact.normal_next)
-    return jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest), 0.0)), jnp.maximum(-jnp.min(distance), 0.0)
+    return jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest), 0.0)), jnp.max(
+        jnp.where(free, -distance, 0.0), initial=0.0
+    )
 
 
 def _host(result, free) -> tuple[float, np.ndarray, float]:

@@ -169,10 +169,12 @@ def quadratic(distance: Array, offset: float) -> Array:
 @contextlib.contextmanager
 def newtons_energies():
     """Inside, our solver has Newton's membrane and contact in place of its own."""
-    with mock.patch.multiple(physics, stretching=neo_hookean, collision=quadratic):
+    try:
+        with mock.patch.multiple(physics, stretching=neo_hookean, collision=quadratic):
+            jax.clear_caches()
+            yield
+    finally:
         jax.clear_caches()
-        yield
-    jax.clear_caches()
 
 
 def at_rest(scene: Scene) -> Rest:

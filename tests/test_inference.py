@@ -121,6 +121,11 @@ def test_what_training_has_not_seen_is_said_and_leaves_the_code_where_training_h
     assert inference.animate(model, motion)[1].all()
     fast = motion._replace(translation=motion.translation * np.float32(1e9))
     assert not inference.animate(model, fast)[1][2:].any()
+    far = motion._replace(translation=motion.translation + np.float32([[3e38, 0, 0]]))
+    stretched = motion._replace(rotations=np.float32(1e25) * motion.rotations)
+    for wild in (far, stretched):
+        vertices, ok = inference.animate(model, wild)
+        assert np.isfinite(vertices).all() and not ok.any()
     latent = model.normalizers.latent
     strict = latent._replace(low=0 * latent.low - 0.5, high=0 * latent.high + 0.5)
     narrow = dataclasses.replace(model, normalizers=model.normalizers._replace(latent=strict))

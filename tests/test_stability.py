@@ -46,6 +46,7 @@ def test_float32_is_as_good_as_it_can_be_near_the_origin_and_far(away):
     errors = energies.precision(small(), away)
     assert len(errors) == 8
     for name, error in errors.items():
+        assert error["value"] != 0, name
         assert error["energy"] <= 1e-5 and error["gradient"] <= 1e-4, (name, error)
 
 
@@ -77,8 +78,6 @@ def test_the_solver_recovers_or_says_that_it_did_not():
     assert len(outcomes) == 7
     assert [name for name, outcome in outcomes.items() if outcome.result == "silent"] == []
     assert outcomes["usual"].result == "recovered"
-    for outcome in outcomes.values():
-        assert outcome.result in ("recovered", "reported")
 
 
 def test_recovery_counts_to_the_last_frame_away():
@@ -89,8 +88,9 @@ def test_recovery_counts_to_the_last_frame_away():
     relative[first + 20] = 1.11
     assert closed_loop.recovery_frames(relative) == 21
     assert closed_loop.recovery_frames(np.ones(first + 50)) == 0
-    relative[-1] = np.nan
-    assert closed_loop.recovery_frames(relative) == 50
+    for lost in (np.nan, 1.2):
+        relative[-1] = lost
+        assert closed_loop.recovery_frames(relative) is None
 
 
 def test_drift_is_that_of_the_farthest_vertex():

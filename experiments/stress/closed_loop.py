@@ -41,7 +41,9 @@ class Shock(NamedTuple):
     """A shock at frame `BEFORE` of a loop, and what came after."""
 
     loop: Loop
-    recovery: int  # frames after the shock until the energy is within `WITHIN` of the undisturbed one, and stays there
+    recovery: (
+        int | None
+    )  # frames after the shock until the energy is within `WITHIN` of the undisturbed one, and stays there
     energy: np.ndarray  # [T] J of the disturbed loop over that of the undisturbed one
 
 
@@ -69,7 +71,8 @@ def measure(whole: Experiment, character: Character, played: tuple) -> Loop:
     strain = (
         metrics.edge_strain(whole.scene, character, vertices[finite])["edge_strain_max"] if finite.any() else np.inf
     )
-    return Loop(len(ok), int((~finite).sum()), int((~ok).sum()), float(np.abs(latents[finite]).max()), strain)
+    code = float(np.abs(latents[finite]).max(initial=0.0))
+    return Loop(len(ok), int((~finite).sum()), int((~ok).sum()), code, strain)
 
 
 def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> dict:
@@ -131,7 +134,7 @@ def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> di
         "phi": {
             "drift_mm": phi_drift,
             "recovery_frames": recovery_frames(relative),
-            "nonfinite": int((~np.isfinite(phi_track)).sum() + (~np.isfinite(thrown)).sum()),
+            "nonfinite": sum(int((~np.isfinite(track)).any(axis=(1, 2)).sum()) for track in (phi_track, thrown)),
             "energy": relative,
         },
     }
@@ -201,8 +204,10 @@ def energies_of(whole: Experiment, character: Character, track: np.ndarray, pose
     )
 
 
-def recovery_frames(relative: np.ndarray) -> int:
-    """Frames after the shock until `energies_of` over undisturbed ones [T] stay within `WITHIN`."""
+def recovery_frames(relative: np.ndarray) -> int | None:
+    """Frames after the shock until `energies_of` over undisturbed ones [T] stay within `WITHIN`; or None."""
     first = BEFORE - 3  # the step whose end is the shock
     away = ~(np.abs(relative[first:] - 1.0) <= WITHIN)
+    if away[-1]:
+        return None
     return int(np.flatnonzero(away)[-1]) + 1 if away.any() else 0

@@ -183,6 +183,7 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
         (energy, gradient), (exact, exact_gradient) = (jax.tree.map(_double, x) for x in (single, double))
     return {
         name: {
+            "value": float(exact[name]),
             "energy": float(abs(energy[name] - exact[name]) / max(abs(exact[name]), 1e-30)),
             "gradient": float(
                 np.linalg.norm(gradient[name] - exact_gradient[name]) / max(np.linalg.norm(exact_gradient[name]), 1e-30)

@@ -55,8 +55,7 @@ def stress(config: Config, frames: int, quick: bool, progress: Callable[[int], N
     usual = dress(betas, cloth)
     first = jax.tree.map(lambda x: x[:2], poses)
     trajectory, _ = simulation.simulate(whole.scene, usual, first, config)
-    advance = np.asarray(poses.translation[1, 2])
-    settled = (trajectory[1], trajectory[2] + 0 * advance)
+    settled = (trajectory[1], trajectory[2])
     later = jax.tree.map(lambda x: x[2 : 2 + frames], poses)
     low = settled[1].min(axis=0) * [0, 1, 0]
     squeezed = tuple(((x - low) * [1, SQUEEZED, 1] + low).astype(np.float32) for x in settled)
