@@ -47,7 +47,7 @@ def step_measures(
     def energy(new: Array, step: TimeStep) -> float:
         # float64 on the host, as the solver has it: differences of energies are small
         with jax.enable_x64(True):
-            step = jax.tree.map(_double, step)
+            step = jax.tree.map(solver.to_float64, step)
             return float(_potential(np.asarray(new, np.float64), step, scene.mesh, config.physics))
 
     measures = []
@@ -152,11 +152,6 @@ def roughness(trajectory: Array, advance: Array) -> float:
 def distance_mm(one: Array, other: Array) -> np.ndarray:
     """Mean vertex distance in mm of each frame of two trajectories [T, V, 3] m: [T]."""
     return 1e3 * np.linalg.norm(np.asarray(one, np.float64) - np.asarray(other, np.float64), axis=-1).mean(-1)
-
-
-def _double(x: Array) -> np.ndarray:
-    x = np.asarray(x)
-    return x.astype(np.float64) if np.issubdtype(x.dtype, np.floating) else x
 
 
 _potential = jax.jit(losses.potential, static_argnums=3)

@@ -115,7 +115,7 @@ def solve_step(
         ValueError: a start that is not finite, or a vertex without mass.
     """
     x = np.array(new0, np.float64)
-    step = jax.tree.map(_to_float64, step)
+    step = jax.tree.map(to_float64, step)
     _check(x, step)
     mesh = jax.tree.map(np.asarray, mesh)
     pattern = structure(step, mesh)
@@ -291,7 +291,8 @@ def _check(x: np.ndarray, step: TimeStep) -> None:
         )
 
 
-def _to_float64(leaf: Array) -> np.ndarray:
+def to_float64(leaf: Array) -> np.ndarray:
+    """An array of floats in float64, any other as it is."""
     leaf = np.asarray(leaf)
     return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
 

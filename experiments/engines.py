@@ -83,9 +83,7 @@ class Reference:
         """One step."""
         fall = np.array([0.0, -physics.GRAVITY * self.timestep**2, 0.0])
         start = np.where(self.scene.pinned[:, None], self.position, self.position + self.velocity + fall)
-        new, info = solver.solve_step(
-            start, self.time_step(), self.scene.mesh, self.scene.pinned, CONFIG, tolerance=1e-6
-        )
+        new, info = solver.solve_step(start, self.time_step(), self.scene.mesh, self.scene.pinned, CONFIG)
         self.position, self.velocity = new, new - self.position
         self.converged &= info.converged
 

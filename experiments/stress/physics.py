@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import character as characters
-from clothjax import clips, contact, experiment, losses, physics, proximity, rollout
+from clothjax import clips, contact, experiment, losses, physics, proximity, rollout, solver
 from clothjax.config import Config
 from clothjax.types import EdgeContact, SelfContact
 
@@ -179,8 +179,8 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
 
     single = jax.jit(evaluate)(new + np.float32(away), moved)
     with jax.enable_x64(True):
-        double = jax.jit(evaluate)(*jax.tree.map(_double, (new + np.float32(away), moved)))
-        (energy, gradient), (exact, exact_gradient) = (jax.tree.map(_double, x) for x in (single, double))
+        double = jax.jit(evaluate)(*jax.tree.map(solver.to_float64, (new + np.float32(away), moved)))
+        (energy, gradient), (exact, exact_gradient) = (jax.tree.map(solver.to_float64, x) for x in (single, double))
     return {
         name: {
             "value": float(exact[name]),
@@ -196,8 +196,3 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
 def with_self_contact(config: Config) -> Config:
     """The same experiment with every term that there is."""
     return replace(config, physics=replace(config.physics, edge_contact=True, self_contact=True, self_offset=0.02))
-
-
-def _double(leaf):
-    leaf = np.asarray(leaf)
-    return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
