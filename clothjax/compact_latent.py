@@ -15,6 +15,8 @@ from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Contact
 
 TYPE_EMBEDDING, LEVEL_EMBEDDING = 9, 4
+LONGEST = 4.0  # times the Newton step of the configured cloth, which others are softer or lighter than
+TINY = 1e-12  # J
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
@@ -141,17 +143,28 @@ def encode(
     return processed.reshape(-1)
 
 
-def descend(params: Params, latent: Array, code: Array, force: Array, stiffness: Array, config: ModelConfig) -> Array:
-    """The next latent code [L]: the current one, moved down the potential and by the network.
+def newton_step(
+    descent: Params,
+    latent: Array,
+    garment: Callable[[Array], Array],
+    potential: Callable[[Array], Array],
+    config: ModelConfig,
+) -> tuple[Array, Array, Array]:
+    """The garment [V, 3] m if held, the force [V, 3] N on it there, and nearly a Newton step [L] from it on Z.
 
-    The Hessian of the potential in the space of codes hardly changes, so its inverse at rest, corrected by a learned
-    matrix, turns the force on Z [L] into nearly a Newton step. It scales with the cloth's `stiffness` over the
-    configured one's. Deep collisions push thousands of times harder than the rest: the step is bounded.
+    The Hessian of the potential in the space of codes hardly changes but for contact, so its inverse at rest gives
+    the direction. The length is exact: to the minimum along it, by the curvature that the potential has now. Without
+    this, cloth that rests on the body is thrown off it and falls back, every other frame.
     """
-    descent = params["descent"]
-    push = config.descent_rate / stiffness * (force @ jax.lax.stop_gradient(descent["inverse_hessian"]))
+    held, pullback = jax.vjp(garment, latent)
+    gradient, hessian = jax.linearize(jax.grad(potential), held)
+    direction = -pullback(gradient)[0] @ descent["inverse_hessian"]
+    _, moved = jax.jvp(garment, (latent,), (direction,))
+    slope, curvature = -jnp.sum(moved * gradient), jnp.sum(moved * hessian(moved))
+    push = slope / jnp.maximum(curvature, jnp.maximum(slope / LONGEST, TINY)) * direction
+    # deep collisions push thousands of times harder than the rest
     push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / config.descent_bound**2)
-    return (1.0 - config.latent_decay) * latent + push + push @ descent["correction"] + code
+    return held, -gradient, jax.lax.stop_gradient(push)
 
 
 def inverse_hessian(potential: Callable[[Array], Array], garment: Params, size: int, config: ModelConfig) -> Array:
@@ -182,26 +195,23 @@ def step(
     """One step of Phi: the next positions [V, 3] m (relative to the current root), its latent code [L], its inputs.
 
     Args:
-        potential: of next positions [V, 3] m in J. Only its gradient at the held garment is used, as an input.
+        potential: of next positions [V, 3] m in J. Of it, the force and the Newton step at the held garment are used.
     """
 
     def garment(latent):
         return decode(params, scene, character, latent, window, model)
 
-    descent = model.latent_update == "descent"
-    if descent:
-        held, pullback = jax.vjp(garment, state.latent)
+    if "descent" in params:
+        held, force, push = newton_step(params["descent"], state.latent, garment, potential, model)
     else:
         displaced = skinning.unapply(window.current.garment, state.position)
         held = skinning.apply(window.following.garment, displaced)
-    force = -jax.grad(potential)(held)
-    code_force = jax.lax.stop_gradient(pullback(force)[0] if descent else jnp.zeros_like(state.latent))
+        force = -jax.grad(potential)(held)
     seen = feature.features(scene, character, state, window, contact, timestep, held, force, model, material)
     seen = jax.lax.stop_gradient(seen)
-    code = encode(params, statistics, scene, seen, model)
-    cloth = character.material
-    stiffness = (2 * cloth.mu + cloth.lam) / (2 * material.mu + material.lam)
-    latent = descend(params, state.latent, code, code_force, stiffness, model) if descent else code
+    latent = encode(params, statistics, scene, seen, model)
+    if "descent" in params:
+        latent += (1.0 - model.latent_decay) * state.latent + push + push @ params["descent"]["correction"]
     return garment(latent), latent, seen
 
 

@@ -141,9 +141,8 @@ class ModelConfig:
     """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
     latent_update: Literal["absolute", "descent"] = "descent"
     """Whether the network gives Z as in the thesis, or its change from the current frame's Z. The change then has a
-    second part: part of a Newton step on the potential, from where the garment would be if held."""
-    descent_rate: float = 0.5
-    """Of that Newton step, at the start of training; a learned matrix corrects it."""
+    second part: nearly a Newton step on the potential, from where the garment would be if held, and a learned linear
+    correction of it."""
     descent_damping: float = 0.1
     """J, added to the Hessian of unit codes: folds are stiffer than the rest shape."""
     descent_bound: float = 0.3

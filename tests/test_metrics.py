@@ -78,29 +78,67 @@ def test_a_term_of_no_weight_is_not_computed():
     assert losses.weighted(terms, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
 
 
-def test_the_inverse_hessian_takes_a_newton_step():
-    """On a quadratic potential one undamped step from anywhere reaches the minimum."""
+@pytest.fixture
+def coded():
+    """A garment of 5 vertices and 3 codes, and the inverse Hessian of its squared distance to a goal."""
     model = dataclasses.replace(
-        Config().model, decoder=(4,), blendshapes=3, descent_damping=1e-9, descent_rate=1.0, descent_bound=1e6,
-        latent_decay=0.0,
-    )  # fmt: skip
+        Config().model, decoder=(4,), blendshapes=3, descent_damping=1e-9, descent_bound=1e6, latent_decay=0.0
+    )
     basis = np.random.default_rng(0).normal(size=(3, 5, 3)).astype(np.float32)
     garment = {"decoder": None, "blendshapes": basis, "skip": jnp.eye(3)}
     garment["decoder"] = jax.tree.map(jnp.zeros_like, compact_latent.init_mlp(jax.random.key(0), (3, 4, 3), norm=False))
-    goal = jnp.asarray(basis[0] - 2 * basis[2])
+
+    def decode(latent):
+        return jnp.einsum("k,kvc->vc", latent, basis, precision="highest")
+
+    goal = decode(jnp.array([1.0, 0.0, -2.0]))
 
     def potential(displacement):
         return jnp.sum((displacement - goal) ** 2)
 
-    inverse = compact_latent.inverse_hessian(potential, garment, 3, model)
-    params = {"descent": {"inverse_hessian": inverse, "correction": jnp.zeros((3, 3))}}
+    descent = {"inverse_hessian": compact_latent.inverse_hessian(potential, garment, 3, model)}
+    return descent, decode, potential, model
+
+
+def test_the_newton_step_reaches_the_minimum_of_a_quadratic(coded):
+    descent, decode, potential, model = coded
     start = jnp.array([0.3, -1.0, 0.7])
-    force = -jax.grad(lambda z: potential(jnp.einsum("k,kvc->vc", z, basis)))(start)
-    found = compact_latent.descend(params, start, jnp.zeros(3), force, jnp.float32(1.0), model)
-    np.testing.assert_allclose(found, [1.0, 0.0, -2.0], atol=1e-4)
+    held, force, push = compact_latent.newton_step(descent, start, decode, potential, model)
+    np.testing.assert_allclose(held, decode(start), atol=1e-6)
+    np.testing.assert_allclose(force, -jax.grad(potential)(held), atol=1e-5)
+    np.testing.assert_allclose(start + push, [1.0, 0.0, -2.0], atol=1e-4)
     bounded = dataclasses.replace(model, descent_bound=0.1)
-    moved = compact_latent.descend(params, start, jnp.zeros(3), 1e6 * force, jnp.float32(1.0), bounded) - start
-    assert float(jnp.linalg.norm(moved)) == pytest.approx(0.1, rel=1e-3)
+    _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: 1e6 * potential(x), bounded)
+    assert float(jnp.linalg.norm(push)) == pytest.approx(0.1, rel=1e-2)
+    _, _, push = compact_latent.newton_step(descent, jnp.array([1.0, 0.0, -2.0]), decode, potential, model)
+    np.testing.assert_allclose(push, 0.0, atol=1e-5)
+
+
+def test_the_newton_step_does_not_overshoot_what_its_hessian_does_not_know(coded):
+    """A floor that is a thousand times stiffer than the cloth: along the direction, the step ends at the minimum."""
+    descent, decode, potential, model = coded
+    start = jnp.array([0.3, -1.0, 0.7])
+
+    def stiff(positions):
+        return potential(positions) + 1e3 * jnp.sum(jnp.maximum(0.5 - positions[:, 1], 0.0) ** 2)
+
+    _, _, push = compact_latent.newton_step(descent, start, decode, stiff, model)
+    along = jax.grad(lambda t: stiff(decode(start + t * push)))
+    assert stiff(decode(start + push)) < stiff(decode(start))
+    assert abs(along(1.0)) < 0.5 * abs(along(0.0))  # the floor's sides change on the way
+    # what the rest Hessian alone would do is worse than to stay
+    full = -jax.grad(lambda z: stiff(decode(z)))(start) @ descent["inverse_hessian"]
+    assert stiff(decode(start + full)) > stiff(decode(start))
+
+
+def test_the_newton_step_of_a_softer_cloth_is_longer(coded):
+    descent, decode, potential, model = coded
+    start = jnp.array([0.3, -1.0, 0.7])
+    _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: potential(x) / 3, model)
+    np.testing.assert_allclose(start + push, [1.0, 0.0, -2.0], atol=1e-4)
+    _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: potential(x) / 400, model)
+    expected = compact_latent.LONGEST / 400
+    np.testing.assert_allclose(push, expected * (jnp.array([1.0, 0.0, -2.0]) - start), rtol=1e-3)
 
 
 def test_pinned_vertices_follow_skinning():
