@@ -78,16 +78,16 @@ def init_statistics(example: Features) -> dict[str, Statistics]:
     return {name: feature.empty_statistics(rows.shape[-1]) for name, rows in columns.items()}
 
 
-def observe(statistics: dict[str, Statistics], seen: Features, limit: int) -> dict[str, Statistics]:
+def observe(statistics: dict[str, Statistics], seen: Features) -> dict[str, Statistics]:
     """Statistics that have also seen a batch of features with leading axes [...]; body nodes count as nodes."""
 
     def rows(*parts):
         return jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
 
     return {
-        "nodes": feature.observe(statistics["nodes"], rows(seen.nodes, seen.body), limit),
-        "mesh": feature.observe(statistics["mesh"], rows(*seen.edges.values()), limit),
-        "world": feature.observe(statistics["world"], rows(seen.to_garment, seen.to_body), limit),
+        "nodes": feature.observe(statistics["nodes"], rows(seen.nodes, seen.body)),
+        "mesh": feature.observe(statistics["mesh"], rows(*seen.edges.values())),
+        "world": feature.observe(statistics["world"], rows(seen.to_garment, seen.to_body)),
     }
 
 

@@ -20,7 +20,7 @@ class Statistics(NamedTuple):
 
     mean: Array  # [N]
     variance: Array  # [N]
-    count: Array  # batches seen
+    count: Array  # rows seen
 
 
 class Features(NamedTuple):
@@ -95,27 +95,32 @@ def features(
         body = jnp.concatenate([body, jnp.zeros_like(extra)], axis=-1)
         edge_points |= {"held": held, "drifted": drifted}
     edges = {
-        name: _mesh_edges(senders, receivers, edge_points, character.template, turn, timestep, inputs)
+        name: mesh_edges(senders, receivers, edge_points, character.template, turn, timestep, inputs)
         for name, (senders, receivers) in scene.graph.items()
     }
 
     offset_now = state.position - current.body[contact.index]
     offset_next = state.position - following.body[contact.index]
-    to_body, to_garment = (
-        jnp.concatenate(
-            [
-                _rotate(turn, sign * offset_now),
-                _length(offset_now),
-                _rotate(turn, sign * offset_next),
-                _length(offset_next),
-                _column(jnp.asarray(timestep), count),
-            ],
-            axis=-1,
-        )
-        for sign in (1.0, -1.0)
-    )
+    to_body, to_garment = pairs(offset_now, offset_next, turn, timestep)
     active = jnp.sum(offset_now * offset_now, axis=-1) <= model.body_radius**2
     return Features(garment, body, edges, to_garment, to_body, slots, active)
+
+
+def pairs(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
+    """Features [V, 9] of the pairs of garment and body vertices, towards the body and towards the garment.
+
+    Args:
+        offset_now, offset_next: [V, 3] m from the body vertex, at this frame and at the next, to the garment vertex.
+    """
+
+    def one(sign):
+        parts = [
+            _rotate(turn, sign * offset_now), _length(offset_now), _rotate(turn, sign * offset_next),
+            _length(offset_next), _column(jnp.asarray(timestep), len(offset_now)),
+        ]  # fmt: skip
+        return jnp.concatenate(parts, axis=-1)
+
+    return one(1.0), one(-1.0)
 
 
 def material_inputs(material: Material, config: MaterialConfig) -> Array:
@@ -169,8 +174,8 @@ def _canonical(character: Character, state: ClothState, window: Window, contact:
     return jnp.concatenate(columns, axis=-1), drifted
 
 
-def _mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
-    """Relative positions now and at rest, and the strain of each guess of the next state."""
+def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
+    """Features [E, 12] of edges: relative positions now and at rest; and the strain of each guess of the next state."""
     rest = template[senders] - template[receivers]
     rest_length = _length(rest)
     now = points["now"][senders] - points["now"][receivers]
@@ -194,26 +199,28 @@ def empty_statistics(columns: int) -> Statistics:
     return Statistics(jnp.zeros(columns), jnp.ones(columns), jnp.zeros(()))
 
 
-def observe(statistics: Statistics, rows: Array, limit: int) -> Statistics:
-    """Statistics that have also seen `rows` [N, columns], unless `limit` batches are already in.
+def observe(statistics: Statistics, rows: Array, counted: Array | None = None) -> Statistics:
+    """Statistics that have also seen `rows` [N, columns], or those of them that are `counted` [N] bool.
 
     Chan's update of mean and variance: E[x^2] - E[x]^2 would lose constant columns to rounding.
     """
-    mean, variance = jnp.mean(rows, axis=0), jnp.var(rows, axis=0)
-    share = 1.0 / (statistics.count + 1.0)
+    weight = jnp.ones_like(rows[:, :1]) if counted is None else counted[:, None].astype(rows.dtype)
+    new = jnp.maximum(jnp.sum(weight), 1.0)
+    mean = jnp.sum(weight * rows, axis=0) / new
+    variance = jnp.sum(weight * jnp.square(rows - mean[None]), axis=0) / new
+    count = statistics.count + jnp.sum(weight)
+    share = jnp.sum(weight) / jnp.maximum(count, 1.0)
     shift = mean - statistics.mean
-    merged = Statistics(
+    return Statistics(
         mean=statistics.mean + share * shift,
         variance=(1.0 - share) * statistics.variance + share * variance + share * (1.0 - share) * shift * shift,
-        count=statistics.count + 1.0,
+        count=count,
     )
-    keep = statistics.count < limit
-    return Statistics(*(jnp.where(keep, new, old) for new, old in zip(merged, statistics)))
 
 
-def normalise(statistics: Statistics, rows: Array, bound: float = 10.0) -> Array:
-    """Features [N, columns] by mean and standard deviation, clipped to `bound` deviations."""
-    deviation = jnp.sqrt(jnp.maximum(statistics.variance, 1e-12))
+def normalise(statistics: Statistics, rows: Array, bound: float = 10.0, least: float = 1e-6) -> Array:
+    """Features [N, columns] by mean and standard deviation, at least `least`, clipped to `bound` deviations."""
+    deviation = jnp.maximum(jnp.sqrt(statistics.variance), least)
     return jnp.clip((rows - statistics.mean[None]) / deviation[None], -bound, bound)
 
 

@@ -34,12 +34,12 @@ def init_mlp(key: Array, sizes: tuple[int, ...], norm: bool = True, last_gain: f
         for i in range(len(sizes) - 1)
     }
     if norm:
-        params["norm"] = nn.LayerNorm(epsilon=1e-5).init(key, jnp.zeros((1, sizes[-1])))["params"]
+        params["norm"] = {"scale": jnp.ones(sizes[-1]), "bias": jnp.zeros(sizes[-1])}
     return params
 
 
 def mlp(params: Params, x: Array) -> Array:
-    """The MLP of `init_mlp` on [..., inputs]."""
+    """The MLP of `init_mlp` on [N, inputs], or without a LayerNorm on [..., inputs]."""
     return _mlp_tail(params, dense(params["dense_0"], x))
 
 
@@ -48,7 +48,10 @@ def _mlp_tail(params: Params, first: Array) -> Array:
     x, layers = first, sum(name.startswith("dense") for name in params)
     for i in range(1, layers):
         x = dense(params[f"dense_{i}"], nn.relu(x))
-    return nn.LayerNorm(epsilon=1e-5).apply({"params": params["norm"]}, x) if "norm" in params else x
+    if "norm" not in params:
+        return x
+    scale, bias = params["norm"]["scale"], params["norm"]["bias"]
+    return jax.nn.standardize(x, epsilon=1e-5) * scale[None] + bias[None]
 
 
 # --- message passing ----------------------------------------------------------------------------------------------

@@ -245,9 +245,9 @@ def make_update(
         following = Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
 
         statistics = jax.lax.cond(
-            metrics["nonfinite"],
+            metrics["nonfinite"] | (state.step >= config.model.normalizer_steps),
             lambda statistics, _: statistics,
-            lambda statistics, seen: compact_latent.observe(statistics, seen, config.model.normalizer_steps),
+            compact_latent.observe,
             state.statistics,
             seen,
         )

@@ -118,17 +118,21 @@ def test_a_garment_elsewhere_is_refused():
         scene.reachable(whole.body, far, 0.35)
 
 
-def test_statistics_are_those_of_all_rows_seen():
+def test_statistics_are_those_of_all_rows_counted():
     random = np.random.default_rng(0)
-    batches = [random.normal(3.0, 2.0, (50, 4)).astype(np.float32) + i for i in range(5)]
-    statistics = features.empty_statistics(4)
-    for batch in batches:
-        statistics = features.observe(statistics, batch, 10)
-    rows = np.concatenate(batches)
-    np.testing.assert_allclose(statistics.mean, rows.mean(0), rtol=1e-5)
-    np.testing.assert_allclose(statistics.variance, rows.var(0), rtol=1e-4)
-    frozen = features.observe(statistics, 100 * batches[0], 5)
-    np.testing.assert_array_equal(frozen.mean, statistics.mean)
+    batches = [random.normal(3.0, 2.0, (10 * i + 10, 4)).astype(np.float32) + i for i in range(5)]
+    counted = [random.random(len(batch)) < 0.5 for batch in batches]
+    counted[2][:] = False  # nothing to see
+    every = some = features.empty_statistics(4)
+    for batch, which in zip(batches, counted):
+        every, some = features.observe(every, batch), features.observe(some, batch, which)
+    for statistics, rows in (
+        (every, np.concatenate(batches)),
+        (some, np.concatenate([batch[which] for batch, which in zip(batches, counted)])),
+    ):
+        np.testing.assert_allclose(statistics.mean, rows.mean(0), rtol=1e-5)
+        np.testing.assert_allclose(statistics.variance, rows.var(0), rtol=1e-4)
+        assert statistics.count == len(rows)
 
 
 def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
