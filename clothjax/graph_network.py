@@ -50,8 +50,27 @@ def _mlp_tail(params: Params, first: Array) -> Array:
         x = dense(params[f"dense_{i}"], nn.relu(x))
     if "norm" not in params:
         return x
-    scale, bias = params["norm"]["scale"], params["norm"]["bias"]
-    return jax.nn.standardize(x, epsilon=1e-5) * scale[None] + bias[None]
+    return _affine(jax.nn.standardize(x, epsilon=1e-5), params["norm"]["scale"], params["norm"]["bias"])
+
+
+@jax.custom_vjp
+def _affine(x: Array, scale: Array, bias: Array) -> Array:
+    """x [N, W] times scale [W] plus bias [W]. Its gradient sums rows by a product: XLA's own sum was a third of a step
+    of training on a CPU."""
+    return x * scale[None] + bias[None]
+
+
+def _affine_forward(x, scale, bias):
+    return _affine(x, scale, bias), (x, scale)
+
+
+def _affine_backward(kept, gradient):
+    x, scale = kept
+    row = jnp.ones((1, len(x)), x.dtype)
+    return gradient * scale[None], (row @ (gradient * x))[0], (row @ gradient)[0]
+
+
+_affine.defvjp(_affine_forward, _affine_backward)
 
 
 # --- message passing ----------------------------------------------------------------------------------------------

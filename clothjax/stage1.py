@@ -215,7 +215,7 @@ def make_update(
         )  # fmt: skip
 
     def batch_loss(params, statistics, simulations, step, clips):
-        loss, rest = jax.vmap(loss_of, (None, None, 0, None, None))(params, statistics, simulations, step, clips)
+        loss, rest = _each(lambda one: loss_of(params, statistics, one, step, clips), simulations)
         return jnp.mean(loss), (loss, rest)
 
     def one(clips: Clips, state: TrainingState, _):
@@ -268,6 +268,13 @@ def make_update(
 
     clips = jax.tree.map(jnp.asarray, clips)
     return lambda state: update(state, clips)
+
+
+def _each(function: Callable, stacked):
+    """`function` of every element of a stack: one alone without vmap, which would slow the searches for contact."""
+    if len(jax.tree.leaves(stacked)[0]) > 1:
+        return jax.vmap(function)(stacked)
+    return jax.tree.map(lambda x: x[None], function(jax.tree.map(lambda x: x[0], stacked)))
 
 
 def _where(condition: Array, new: Array, old: Array) -> Array:

@@ -1,7 +1,9 @@
 """Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (21)."""
 
+import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -19,6 +21,9 @@ from clothjax.fit import Weights
 from clothjax.latent_predictor import Normalizers
 from clothjax.scene import Scene
 from clothjax.types import Array, Pose
+
+TOGETHER = {"cpu": 4}  # sequences of the teacher in one program; elsewhere ...
+MANY = 64
 
 
 class Teacher(NamedTuple):
@@ -81,11 +86,14 @@ def teach(
 
     run = jax.jit(jax.vmap(sequence))
     keys = jax.random.split(jax.random.key(stage.seed + 1), stage.sequences)
-    size = min(8, stage.sequences)  # sequences at a time: enough to fill the cores, little memory
+    size = min(TOGETHER.get(jax.default_backend(), MANY), stage.sequences)
     parts = []
-    for start in range(0, stage.sequences, size):
-        parts.append(jax.device_get(run(keys[start : start + size])))
-        progress(min(start + size, stage.sequences))
+    # a rollout is one thing after another, which leaves all but one of a CPU's cores idle: several programs at once
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
+        starts = range(0, stage.sequences, size)
+        for part in pool.map(lambda start: jax.device_get(run(keys[start : start + size])), starts):
+            parts.append(part)
+            progress(min(len(parts) * size, stage.sequences))
     teacher = Teacher(*(np.concatenate(part) for part in zip(*parts)))
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():

@@ -200,6 +200,19 @@ def test_every_block_is_hoods(golden, shared):
     assert done == 15
 
 
+def test_the_gradient_of_scale_and_bias_is_jaxs_own():
+    random = np.random.default_rng(0)
+    x, weight, scale, bias = (jnp.asarray(random.normal(size=s)) for s in ((7, 5), (7, 5), 5, 5))
+
+    def loss(affine):
+        return lambda *args: jnp.sum(weight * affine(*args) ** 3)
+
+    ours = jax.grad(loss(graph_network._affine), (0, 1, 2))(x, scale, bias)
+    jaxs = jax.grad(loss(lambda x, s, b: x * s[None] + b[None]), (0, 1, 2))(x, scale, bias)
+    for one, other in zip(ours, jaxs):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 def test_pinned_vertices_go_where_they_are_told(golden):
     garment = cloth(golden)._replace(mass=golden["v_mass"])
     params = jax.tree.map(jnp.asarray, ours(torch_parameters(golden)))
