@@ -91,14 +91,14 @@ def observe(statistics: dict[str, Statistics], seen: Features) -> dict[str, Stat
     }
 
 
-def encode(
+def pass_messages(
     params: Params,
     statistics: dict[str, Statistics],
     scene: Scene,
     seen: Features,
     config: ModelConfig,
 ) -> Array:
-    """Encode, Process, Convolve: a latent code [L] from features."""
+    """Encode and Process: node latents [V, W] of the garment from features."""
     encoder = params["encoder"]
     pinned = scene.garment.pinned.astype(jnp.int32)
     kinds = params["type_embedding"]
@@ -116,7 +116,7 @@ def encode(
     updated = config.body_nodes == "updated"
     if updated:
         world["to_body"] = mlp(encoder["world"], feature.normalise(statistics["world"], seen.to_body))
-    processed = graph_network.process(
+    return graph_network.process(
         params["processor"],
         config.processor,
         garment,
@@ -129,6 +129,17 @@ def encode(
         update_body=updated,
         remat=config.remat,
     )
+
+
+def encode(
+    params: Params,
+    statistics: dict[str, Statistics],
+    scene: Scene,
+    seen: Features,
+    config: ModelConfig,
+) -> Array:
+    """Encode, Process, Convolve: a latent code [L] from features."""
+    processed = pass_messages(params, statistics, scene, seen, config)
     for block, table in zip(params["convolution"], scene.tables):
         processed = mesh_convolution.apply(
             block,

@@ -152,6 +152,18 @@ def test_the_rollout_grows_with_the_curriculum():
     assert [stage1.rollout_length(step, config) for step in (0, 4999, 5000, 20000, 10**6)] == [1, 1, 2, 5, 5]
 
 
+def test_one_alone_is_treated_like_one_of_many():
+    stack = {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
+
+    def function(one):
+        return jnp.sum(one["a"]) * 2.0, one["b"] + 1
+
+    many = stage1._each(function, stack)
+    for index in range(3):
+        alone = stage1._each(function, jax.tree.map(lambda x, i=index: x[i : i + 1], stack))
+        assert_same(alone, jax.tree.map(lambda x, i=index: x[i : i + 1], many))
+
+
 def test_materials_are_drawn_from_their_ranges():
     config = Config()
     drawn = jax.vmap(lambda key: stage1.sample_material(key, config))(jax.random.split(jax.random.key(0), 500))

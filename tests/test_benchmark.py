@@ -1,0 +1,43 @@
+"""The benchmark measures what it says: the same result in both forms, and figures of programs that ran."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import small
+
+from experiments import benchmark
+from experiments.benchmarks import stage1, timing
+
+
+def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
+    config = small()
+    config = dataclasses.replace(
+        config, motions=("walk_0",), model=dataclasses.replace(config.model, body_nodes="updated")
+    )
+    monkeypatch.setattr(benchmark.configuration, "cli", lambda *_: config)
+    monkeypatch.setattr(stage1, "CONVOLUTION", (3, 4))
+    benchmark.main(["--quick", "--json", str(tmp_path / "b.json")])
+    report = json.loads((tmp_path / "b.json").read_text())
+    assert json.dumps(report, indent=1) in capsys.readouterr().out
+    figures = report["stage1"]
+    assert figures["vertices"] == 1016 and report["machine"]["jax"] == jax.__version__
+    assert figures["processor_error_float32"] <= 1e-5
+    assert figures["processor_error_float64"] <= 1e-12
+    assert figures["mesh_convolution_error"] <= 1e-5
+    for part in ("processor", "mesh_convolution"):
+        for form in figures[part].values():
+            assert form["seconds"] > 0 and form["temporary_mib"] > 0 and form["flops"] > 0
+    ratio = figures["processor"]["textbook"]["seconds"] / figures["processor"]["ours"]["seconds"]
+    assert figures["processor_speedup"] == pytest.approx(ratio)
+
+
+def test_what_is_counted_is_what_the_program_does():
+    one = timing.program(lambda a, b: a @ b, jnp.ones((64, 32)), jnp.ones((32, 16)))
+    np.testing.assert_array_equal(one.run(), 32.0)
+    assert timing.cost(one)["flops"] == pytest.approx(2 * 64 * 32 * 16, rel=0.05)
+    seconds = timing.interleaved({"small": one, "large": timing.program(lambda a: a @ a, jnp.ones((1500, 1500)))}, 3)
+    assert 0 < seconds["small"] < seconds["large"]
