@@ -15,8 +15,7 @@ from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Contact
 
 TYPE_EMBEDDING, LEVEL_EMBEDDING = 9, 4
-LONGEST = 4.0  # times the Newton step of the configured cloth, which others are softer or lighter than
-TINY = 1e-12  # J
+MAX_LENGTH = 4.0  # of the step, where 1 is the configured cloth's at rest: others are softer or lighter
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
@@ -164,15 +163,17 @@ def newton_step(
     """The garment [V, 3] m if held, the force [V, 3] N on it there, and nearly a Newton step [L] from it on Z.
 
     The Hessian of the potential in the space of codes hardly changes but for contact, so its inverse at rest gives
-    the direction. The length is exact: to the minimum along it, by the curvature that the potential has now. Without
-    this, cloth that rests on the body is thrown off it and falls back, every other frame.
+    the direction. The length is that of Newton's method along it, by the curvature that the potential has now: cloth
+    that rests on the body is stiffer than any at rest, and would be thrown off it.
     """
     held, pullback = jax.vjp(garment, latent)
     gradient, hessian = jax.linearize(jax.grad(potential), held)
-    direction = -pullback(gradient)[0] @ descent["inverse_hessian"]
+    direction = -jnp.matmul(pullback(gradient)[0], descent["inverse_hessian"], precision="highest")
     _, moved = jax.jvp(garment, (latent,), (direction,))
-    slope, curvature = -jnp.sum(moved * gradient), jnp.sum(moved * hessian(moved))
-    push = slope / jnp.maximum(curvature, jnp.maximum(slope / LONGEST, TINY)) * direction
+    slope, curvature = jnp.maximum(-jnp.sum(moved * gradient), 0.0), jnp.sum(moved * hessian(moved))
+    convex = curvature > 0
+    length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
+    push = length * direction
     # deep collisions push thousands of times harder than the rest
     push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / config.descent_bound**2)
     return held, -gradient, jax.lax.stop_gradient(push)
@@ -187,7 +188,7 @@ def inverse_hessian(potential: Callable[[Array], Array], garment: Params, size: 
 
     values, vectors = jnp.linalg.eigh(jax.hessian(energy)(jnp.zeros(size)))
     inverse = 1.0 / (jnp.maximum(values, 0.0) + config.descent_damping)
-    return (vectors * inverse[None]) @ vectors.T
+    return jnp.matmul(vectors * inverse[None], vectors.T, precision="highest")
 
 
 def step(
@@ -213,7 +214,12 @@ def step(
         return decode(params, scene, character, latent, window, model)
 
     if "descent" in params:
-        held, force, push = newton_step(params["descent"], state.latent, garment, potential, model)
+        fixed, now = jax.lax.stop_gradient((params, state.latent))
+
+        def held_garment(latent):
+            return decode(fixed, scene, character, latent, window, model)
+
+        held, force, push = newton_step(fixed["descent"], now, held_garment, potential, model)
     else:
         displaced = skinning.unapply(window.current.garment, state.position)
         held = skinning.apply(window.following.garment, displaced)

@@ -101,12 +101,12 @@ def features(
 
     offset_now = state.position - current.body[contact.index]
     offset_next = state.position - following.body[contact.index]
-    to_body, to_garment = pairs(offset_now, offset_next, turn, timestep)
+    to_body, to_garment = world_edges(offset_now, offset_next, turn, timestep)
     active = jnp.sum(offset_now * offset_now, axis=-1) <= model.body_radius**2
     return Features(garment, body, edges, to_garment, to_body, slots, active)
 
 
-def pairs(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
+def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
     """Features [V, 9] of the pairs of garment and body vertices, towards the body and towards the garment.
 
     Args:
@@ -175,7 +175,12 @@ def _canonical(character: Character, state: ClothState, window: Window, contact:
 
 
 def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
-    """Features [E, 12] of edges: relative positions now and at rest; and the strain of each guess of the next state."""
+    """Features of edges: relative positions now and at rest, [E, 12]; and the strain of each guess of the next state.
+
+    Args:
+        points: [V, 3] m by name: `now`, and the guesses `held` and `drifted` where there are any.
+        template: [V, 3] m, at rest; turn: [3, 3] into the frame of the features; inputs: [3] the material.
+    """
     rest = template[senders] - template[receivers]
     rest_length = _length(rest)
     now = points["now"][senders] - points["now"][receivers]
@@ -205,6 +210,7 @@ def observe(statistics: Statistics, rows: Array, counted: Array | None = None) -
     Chan's update of mean and variance: E[x^2] - E[x]^2 would lose constant columns to rounding.
     """
     weight = jnp.ones_like(rows[:, :1]) if counted is None else counted[:, None].astype(rows.dtype)
+    rows = jnp.where(weight > 0, rows, 0.0)
     new = jnp.maximum(jnp.sum(weight), 1.0)
     mean = jnp.sum(weight * rows, axis=0) / new
     variance = jnp.sum(weight * jnp.square(rows - mean[None]), axis=0) / new
@@ -220,7 +226,7 @@ def observe(statistics: Statistics, rows: Array, counted: Array | None = None) -
 
 def normalise(statistics: Statistics, rows: Array, bound: float = 10.0, least: float = 1e-6) -> Array:
     """Features [N, columns] by mean and standard deviation, at least `least`, clipped to `bound` deviations."""
-    deviation = jnp.maximum(jnp.sqrt(statistics.variance), least)
+    deviation = jnp.sqrt(jnp.maximum(statistics.variance, least**2))
     return jnp.clip((rows - statistics.mean[None]) / deviation[None], -bound, bound)
 
 

@@ -56,7 +56,7 @@ def _mlp_tail(params: Params, first: Array) -> Array:
 @jax.custom_vjp
 def _affine(x: Array, scale: Array, bias: Array) -> Array:
     """x [N, W] times scale [W] plus bias [W]. Its gradient sums rows by a product: XLA's own sum was a third of a step
-    of training on a CPU."""
+    of training on a CPU. A custom rule for the backward pass: there is no forward-mode derivative of it."""
     return x * scale[None] + bias[None]
 
 
@@ -66,8 +66,11 @@ def _affine_forward(x, scale, bias):
 
 def _affine_backward(kept, gradient):
     x, scale = kept
-    row = jnp.ones((1, len(x)), x.dtype)
-    return gradient * scale[None], (row @ (gradient * x))[0], (row @ gradient)[0]
+
+    def row_sum(rows):
+        return jnp.matmul(jnp.ones((1, len(rows)), rows.dtype), rows, precision="highest")[0]
+
+    return gradient * scale[None], row_sum(gradient * x), row_sum(gradient)
 
 
 _affine.defvjp(_affine_forward, _affine_backward)

@@ -1,5 +1,5 @@
-"""HOOD (Grigorev et al. 2023), as published, of the parts that Phi is made of: a baseline, and what the golden values
-of its own code are compared with.
+"""HOOD (Grigorev et al. 2023), as published, of the parts that Phi is made of: what shows, against the values of HOOD's
+own code, that they are right.
 
 It predicts an acceleration of every vertex where Phi predicts a code; there is no rig in it, only positions.
 """
@@ -39,7 +39,7 @@ class Cloth(NamedTuple):
     mass: Array  # [V] kg
     materials: Array  # [3] bending, mu and lambda, scaled to [0, 1]
     pinned: Array  # [V] bool
-    graph: dict[str, EdgeSet]  # `mesh`, `coarse0`, `coarse1` and `coarse2`, whose edges are only counted
+    graph: dict[str, EdgeSet]  # `mesh`, `coarse0`, `coarse1`, and `coarse2`, which only the statistics see
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     body_faces: Array  # [Fb, 3] int32
     omitted: Array  # [B] bool, body vertices that touch nothing: hands
@@ -50,7 +50,7 @@ class State(NamedTuple):
 
     previous: Array  # [V, 3] m
     position: Array  # [V, 3] m
-    velocity: Array  # [V, 3] m per frame
+    velocity: Array  # [V, 3] m per frame; 0 at pinned vertices, which are taken to have arrived
 
 
 class Step(NamedTuple):
@@ -158,7 +158,7 @@ def step(
         )
         edges[name] = normalised("mesh", rows)
     del edges["coarse2"]
-    to_body, to_garment = feature.pairs(offset, position - following[index], level_frame, timestep)
+    to_body, to_garment = feature.world_edges(offset, position - following[index], level_frame, timestep)
     world = normalised("world", jnp.concatenate([to_body, to_garment]), jnp.concatenate([active, active]))
 
     encoder = params["encoder"]
@@ -179,9 +179,8 @@ def step(
     )
     output = mlp(params["decoder"], processed)
     scale = used["output"]
-    acceleration = output * jnp.maximum(jnp.sqrt(scale.variance), LEAST)[None] + scale.mean[None]
+    acceleration = output * jnp.sqrt(jnp.maximum(scale.variance, LEAST**2))[None] + scale.mean[None]
     if training:
-        used["output"] = feature.observe(scale, target - 2.0 * position + previous)
-    velocity = jnp.where(fixed, target - position, state.velocity + acceleration)
-    new = jnp.where(fixed, target, position + velocity)
-    return State(position, new, velocity), used, Step(acceleration, output, active, slots, vertices)
+        used["output"] = feature.observe(scale, jax.lax.stop_gradient(target - 2.0 * position + previous))
+    velocity = jnp.where(fixed, 0.0, state.velocity + acceleration)  # pinned vertices are at their target already
+    return State(position, position + velocity, velocity), used, Step(acceleration, output, active, slots, vertices)

@@ -22,8 +22,7 @@ from clothjax.latent_predictor import Normalizers
 from clothjax.scene import Scene
 from clothjax.types import Array, Pose
 
-TOGETHER = {"cpu": 4}  # sequences of the teacher in one program; elsewhere ...
-MANY = 64
+ON_CPU, ELSEWHERE = 4, 64  # sequences of the teacher in one program
 
 
 class Teacher(NamedTuple):
@@ -86,10 +85,11 @@ def teach(
 
     run = jax.jit(jax.vmap(sequence))
     keys = jax.random.split(jax.random.key(stage.seed + 1), stage.sequences)
-    size = min(TOGETHER.get(jax.default_backend(), MANY), stage.sequences)
+    on_cpu = jax.default_backend() == "cpu"
+    size = min(ON_CPU if on_cpu else ELSEWHERE, stage.sequences)
     parts = []
-    # a rollout is one thing after another, which leaves all but one of a CPU's cores idle: several programs at once
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
+    # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
+    with ThreadPoolExecutor(os.cpu_count() if on_cpu else 1) as pool:
         starts = range(0, stage.sequences, size)
         for part in pool.map(lambda start: jax.device_get(run(keys[start : start + size])), starts):
             parts.append(part)

@@ -114,7 +114,7 @@ def test_graph_and_masses_are_hoods(golden):
 
 
 def test_three_steps_of_a_rollout_are_hoods(golden):
-    """The closed loop of training: raw state in, statistics that grow, node latents after all blocks, positions out."""
+    """Of training: raw states in, statistics that grow from step to step, positions out."""
     garment = cloth(golden)._replace(mass=golden["v_mass"])
     params = jax.tree.map(jnp.asarray, ours(torch_parameters(golden)))
     statistics = hood.init_statistics()

@@ -131,13 +131,26 @@ def test_the_newton_step_does_not_overshoot_what_its_hessian_does_not_know(coded
     assert stiff(decode(start + full)) > stiff(decode(start))
 
 
+def test_the_newton_step_where_the_potential_has_no_minimum_or_is_at_one(coded):
+    descent, decode, potential, model = coded
+    start = jnp.array([0.3, -1.0, 0.7])
+    _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: -potential(x), model)
+    # as long as the cloth at rest would have it, and downhill
+    np.testing.assert_allclose(push, start - jnp.array([1.0, 0.0, -2.0]), atol=1e-4)
+    _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: 0.0 * jnp.sum(x), model)
+    np.testing.assert_array_equal(push, 0.0)
+    wrong = {"inverse_hessian": -descent["inverse_hessian"]}
+    _, _, push = compact_latent.newton_step(wrong, start, decode, potential, model)
+    np.testing.assert_array_equal(push, 0.0)
+
+
 def test_the_newton_step_of_a_softer_cloth_is_longer(coded):
     descent, decode, potential, model = coded
     start = jnp.array([0.3, -1.0, 0.7])
     _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: potential(x) / 3, model)
     np.testing.assert_allclose(start + push, [1.0, 0.0, -2.0], atol=1e-4)
     _, _, push = compact_latent.newton_step(descent, start, decode, lambda x: potential(x) / 400, model)
-    expected = compact_latent.LONGEST / 400
+    expected = compact_latent.MAX_LENGTH / 400
     np.testing.assert_allclose(push, expected * (jnp.array([1.0, 0.0, -2.0]) - start), rtol=1e-3)
 
 

@@ -1,5 +1,7 @@
 """What a training step of Phi costs, part by part."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,16 +28,22 @@ def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict
     """Encoder and processor, forward and backward, against the textbook's."""
     state, seen = example(whole, config)
 
-    def loss(form):
+    def loss(form, model):
         def total(params, statistics, seen):
-            return jnp.mean(form(params, statistics, whole.scene, seen, config.model) ** 2)
+            return jnp.mean(form(params, statistics, whole.scene, seen, model) ** 2)
 
         return jax.value_and_grad(total)
 
     names = ("type_embedding", "level_embedding", "encoder", "processor")
     params = {name: state.params[name] for name in names}
     forms = {"ours": compact_latent.pass_messages, "textbook": textbook.process}
-    programs = {name: program(loss(form), params, state.statistics, seen) for name, form in forms.items()}
+    arguments = (params, state.statistics, seen)
+    kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
+    programs = {
+        "ours": program(loss(forms["ours"], recomputed), *arguments),
+        "ours, nothing recomputed": program(loss(forms["ours"], kept), *arguments),
+        "textbook": program(loss(forms["textbook"], kept), *arguments),
+    }
     seconds = interleaved(programs, rounds)
     memory = {name: temporary_bytes(one) for name, one in programs.items()}
 
@@ -46,7 +54,6 @@ def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict
         )
         return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
 
-    arguments = (params, state.statistics, seen)
     single = difference()
     with jax.enable_x64(True):
         arguments = jax.tree.map(_double, arguments)
@@ -56,10 +63,7 @@ def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict
         "processor_memory_ratio": memory["ours"] / memory["textbook"],
         "processor_error_float32": single,
         "processor_error_float64": double,
-        "processor": {
-            name: {"seconds": seconds[name], "temporary_mib": memory[name] / 2**20, **cost(programs[name])}
-            for name in programs
-        },
+        "processor": {name: {"seconds": seconds[name], "temporary_mib": memory[name] / 2**20} for name in programs},
     }
 
 
