@@ -35,29 +35,6 @@ def trained():
     return model, Motion(clip.rotations[:30], clip.translation[:30].astype(np.float32), clip.fps), teacher
 
 
-def test_the_teacher_is_the_same_however_its_sequences_are_shared_out(monkeypatch):
-    """Several programs at once: all sequences, in their order."""
-    config = dataclasses.replace(small(), motions=("walk_0",))
-    config = dataclasses.replace(config, stage2=dataclasses.replace(config.stage2, sequences=4, frames=3))
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
-    first = stage1.init(whole.scene, reel, config)
-    phi = {"params": first.params, "statistics": first.statistics}
-    told = []
-    found = []
-    for size in (2, 4):
-        monkeypatch.setattr(stage2, "ON_CPU", size)
-        found.append(stage2.teach(phi, whole.scene, reel, np.arange(3), config, told.append)[0])
-    assert told == [2, 4, 4]
-    one, other = found
-    np.testing.assert_array_equal(one.constants, other.constants)
-    np.testing.assert_allclose(one.poses, other.poses, atol=1e-4)
-    # an untrained network among deep collisions: other programs round differently; no two sequences are so near
-    np.testing.assert_allclose(one.latents, other.latents, atol=3e-3)
-    apart = np.abs(one.latents[:, None, 1:] - one.latents[None, :, 1:]).max(axis=(2, 3))
-    assert apart[~np.eye(4, dtype=bool)].min() > 3e-2
-
-
 def test_animate_is_step_over_the_frames(trained):
     model, motion, _ = trained
     vertices, ok = inference.animate(model, motion)
