@@ -130,15 +130,8 @@ def pass_messages(
     )
 
 
-def encode(
-    params: Params,
-    statistics: dict[str, Statistics],
-    scene: Scene,
-    seen: Features,
-    config: ModelConfig,
-) -> Array:
-    """Encode, Process, Convolve: a latent code [L] from features."""
-    processed = pass_messages(params, statistics, scene, seen, config)
+def convolve(params: Params, scene: Scene, processed: Array, config: ModelConfig) -> Array:
+    """Convolve: a latent code [L] from node latents [V, W]."""
     for block, table in zip(params["convolution"], scene.tables):
         processed = mesh_convolution.apply(
             block,
@@ -226,7 +219,8 @@ def step(
         force = -jax.grad(potential)(held)
     seen = feature.features(scene, character, state, window, contact, timestep, held, force, model, material)
     seen = jax.lax.stop_gradient(seen)
-    latent = encode(params, statistics, scene, seen, model)
+    processed = pass_messages(params, statistics, scene, seen, model)
+    latent = convolve(params, scene, processed, model)
     if "descent" in params:
         latent += (1.0 - model.latent_decay) * state.latent + push + push @ params["descent"]["correction"]
     return garment(latent), latent, seen
@@ -240,10 +234,8 @@ def decode(params: Params, scene: Scene, character: Character, latent: Array, wi
 
 
 def _active(scene: Scene, seen: Features, config: ModelConfig) -> dict[str, Array]:
-    """Which pairs pass messages in each stack: all where the fine mesh does, else those at its coarse vertices."""
-    active = {}
-    for index, stack in enumerate(config.processor):
-        coarse = [int(name.removeprefix("coarse")) for name in stack.edges if name != "mesh"]
-        lowest = 0 if "mesh" in stack.edges else 1 + min(coarse)
-        active[str(index)] = seen.active & jnp.asarray(scene.level >= lowest)
-    return active
+    """Which pairs pass messages in each stack: those at vertices that have edges in it."""
+    return {
+        str(index): seen.active & jnp.asarray(scene.level >= stack.lowest_level)
+        for index, stack in enumerate(config.processor)
+    }

@@ -110,6 +110,11 @@ class Stack:
     edges: tuple[str, ...]
     blocks: int
 
+    @property
+    def lowest_level(self) -> int:
+        """Of the vertices that have edges in it: 0 with the fine mesh, else one more than its finest coarse level."""
+        return min(0 if name == "mesh" else 1 + int(name.removeprefix("coarse")) for name in self.edges)
+
 
 @dataclass(frozen=True)
 class Level:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import clips, scene, storage
+from clothjax import clips, plausibility, scene, storage
 from clothjax.clips import Clips
 from clothjax.config import Config
 from clothjax.scene import Scene
@@ -53,7 +53,7 @@ def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
     """The training clips on one reel, and the number of frames left out of each for moving impossibly fast."""
     names = training_motions(experiment.config)
     motions = [motion(experiment, name) for name in names]
-    bad = [storage.bad_frames(clip, experiment.body) for clip in motions]
+    bad = [plausibility.bad_frames(clip, experiment.body) for clip in motions]
     # the kind of motion, as in walk_0 or cmu_01_02: kinds are drawn equally often
     families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
     shortest = max(experiment.config.stage1.rollout_end, experiment.config.stage1.rollout) + 1

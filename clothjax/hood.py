@@ -163,7 +163,6 @@ def step(
 
     encoder = params["encoder"]
     nodes, world = mlp(encoder["nodes"], nodes), mlp(encoder["world"], world)
-    lowest = [0 if "mesh" in stack.edges else 1 + int(min(stack.edges)[-1]) for stack in SCHEDULE]
     processed = graph_network.process(
         params["processor"],
         SCHEDULE,
@@ -173,7 +172,7 @@ def step(
         {"to_body": world[:count], "to_garment": world[count:]},
         cloth.graph,
         slots,
-        {str(stack): active & (cloth.level >= least) for stack, least in enumerate(lowest)},
+        {str(index): active & (cloth.level >= stack.lowest_level) for index, stack in enumerate(SCHEDULE)},
         update_body=True,
         remat=False,
     )

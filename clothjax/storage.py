@@ -220,38 +220,6 @@ def save_motion(
     _write(path, "motion", data, fps=float(motion.fps), name=name, source=source, licence=licence)
 
 
-# Plausibility of a motion
-
-
-def joint_positions(motion: Motion, body: Body) -> np.ndarray:
-    """World positions [T, J, 3] in metres of the body's joints (betas 0) through a clip."""
-    rotations = np.asarray(motion.rotations, np.float64)
-    joints, parents = np.asarray(body.joints, np.float64), np.asarray(body.parents)
-    turned, place = np.empty_like(rotations), np.empty(rotations.shape[:3])
-    for j, parent in enumerate(parents):
-        if parent < 0:
-            turned[:, j] = rotations[:, j]
-            place[:, j] = joints[j] + np.asarray(motion.translation, np.float64)
-        else:
-            turned[:, j] = turned[:, parent] @ rotations[:, j]
-            place[:, j] = place[:, parent] + turned[:, parent] @ (joints[j] - joints[parent])
-    return place
-
-
-def bad_frames(motion: Motion, body: Body, limit: float = 0.12) -> np.ndarray:
-    """Frames that no body could have moved through: a joint's position has too large a second difference.
-
-    Args:
-        limit: m per frame^2 at 30 fps; scaled by (30 / fps)^2 for another rate. 0.12 is 11 g.
-
-    Returns:
-        Indices of the middle frames, ascending: a trainer leaves out windows that contain one.
-    """
-    second = np.diff(joint_positions(motion, body), n=2, axis=0)
-    largest = np.linalg.norm(second, axis=-1).max(axis=-1)
-    return np.flatnonzero(largest > limit * (30.0 / motion.fps) ** 2) + 1
-
-
 # One dataset at a time
 
 

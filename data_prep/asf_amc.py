@@ -14,7 +14,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import bad_frames, joint_names, load_body, save_motion
+from clothjax.plausibility import bad_frames
+from clothjax.storage import joint_names, load_body, save_motion
 from data_prep.retarget import Capture, numbers, read_lines, retarget
 
 CMU_NAMES = {

@@ -13,7 +13,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import bad_frames, joint_names, load_body, save_motion
+from clothjax.plausibility import bad_frames
+from clothjax.storage import joint_names, load_body, save_motion
 from data_prep.retarget import Capture, cmu_names, numbers, read_lines, retarget
 
 DAZ_NAMES = {"hip": "Hips", "abdomen": "LowerBack", "chest": "Spine1", "neck": "Neck", "head": "Head"}

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from clothjax import configuration
+from clothjax import config, configuration
 
 
 @dataclass(frozen=True)
@@ -197,3 +197,10 @@ def test_round_trip_through_json():
     stored["train"]["step"] = 3
     with pytest.raises(ValueError, match=r"runs/x: train\.step: unknown key"):
         configuration.from_dict(Config, stored, source="runs/x")
+
+
+@pytest.mark.parametrize(
+    "edges, level", [(("mesh",), 0), (("coarse0", "mesh"), 0), (("coarse0", "coarse1"), 1), (("coarse1",), 2)]
+)
+def test_the_vertices_that_a_stack_reaches(edges, level):
+    assert config.Stack(edges, 1).lowest_level == level

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from clothjax import storage
+from clothjax import plausibility, storage
 from clothjax.types import Body
 from data_prep import anny, asf_amc, bvh, garment, mesh, procedural, retarget
 from data_prep.diffusion import diffuse
@@ -41,8 +41,8 @@ def test_generated_motion_is_possible_and_stands_on_the_floor(kind, body):
         assert motion.rotations.shape == (121, 31, 3, 3)
         product = motion.rotations @ np.swapaxes(motion.rotations, -1, -2)
         np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
-        assert storage.bad_frames(motion, body, limit=0.115).size == 0
-        toes = storage.joint_positions(motion, body)[..., 1].min(axis=1)
+        assert plausibility.bad_frames(motion, body, limit=0.115).size == 0
+        toes = plausibility.joint_positions(motion, body)[..., 1].min(axis=1)
         assert -0.02 < np.percentile(toes, 10) < 0.09  # the toe joint is a few cm within the foot
 
 
@@ -55,7 +55,7 @@ def test_generated_motion_is_the_earlier_one(kind, body, names):
     """
     found = procedural.generate(kind, 1)
     wanted = storage.load_motion(SHARED / f"motion/proc_{kind}_1.motion.h5", names)
-    shift = storage.joint_positions(found, body) - storage.joint_positions(wanted, body)
+    shift = plausibility.joint_positions(found, body) - plausibility.joint_positions(wanted, body)
     assert np.median(np.linalg.norm(shift, axis=-1)) < 0.03
     if kind in procedural.SMOOTHING:
         assert np.abs(shift[:, 0]).max() < 0.15
@@ -74,7 +74,7 @@ def test_generated_motion_at_another_rate(body):
     """Twice the frames of the same motion, smoothing included."""
     slow, fast = procedural.generate("jump", 2, 4.0, 30.0), procedural.generate("jump", 2, 4.0, 60.0)
     assert len(fast.translation) == 2 * len(slow.translation) - 1
-    distance = storage.joint_positions(fast, body)[::2] - storage.joint_positions(slow, body)
+    distance = plausibility.joint_positions(fast, body)[::2] - plausibility.joint_positions(slow, body)
     assert np.abs(distance).max() < 0.01
 
 
@@ -333,7 +333,7 @@ def test_cmu_recording(tmp_path, body, names):
     asf_amc.main(asf_amc.Arguments(raw / "02.asf.gz", raw / "02_01.amc.gz", out, freeze=False))
     found = storage.load_motion(out, names)
     wanted = storage.load_motion(SHARED / "motion/cmu_02_01.motion.h5", names)
-    shift = storage.joint_positions(found, body) - storage.joint_positions(wanted, body)
+    shift = plausibility.joint_positions(found, body) - plausibility.joint_positions(wanted, body)
     assert np.abs(shift).max() < 0.01
     assert np.abs(shift - shift[:1, :1]).max() < 1e-5
 

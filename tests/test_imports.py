@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-HOST = {"config", "configuration", "graph_sampling", "run_folder", "storage", "topology"}
+HOST = {"config", "configuration", "graph_sampling", "plausibility", "run_folder", "storage", "topology"}
 TRAINING = {"fit", "stage1", "stage2"}
 
 

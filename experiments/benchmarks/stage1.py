@@ -8,7 +8,7 @@ import numpy as np
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, experiment, graph_sampling, mesh_convolution, rollout
+from clothjax import compact_latent, experiment, graph_sampling, mesh_convolution, rollout, solver
 from clothjax import stage1 as training
 from clothjax.config import Config
 from experiments.benchmarks import textbook
@@ -56,7 +56,7 @@ def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict
 
     single = difference()
     with jax.enable_x64(True):
-        arguments = jax.tree.map(_double, arguments)
+        arguments = jax.tree.map(solver.to_float64, arguments)
         double = difference()
     return {
         "processor_speedup": seconds["textbook"] / seconds["ours"],
@@ -117,7 +117,3 @@ def example(whole: experiment.Experiment, config: Config):
         )  # fmt: skip
 
     return state, jax.jit(features)(jax.random.key(0))
-
-
-def _double(x):
-    return x.astype(jnp.float64) if x.dtype == jnp.float32 else x

@@ -35,9 +35,7 @@ def process(params, statistics, scene, seen, config) -> Array:
     pairs = jnp.concatenate([seen.to_garment, seen.to_body])
     edges["world"] = mlp(encoder["world"], feature.normalise(statistics["world"], pairs))
     for stack, stacked in zip(config.processor, params["processor"]):
-        coarse = [int(name.removeprefix("coarse")) for name in stack.edges if name != "mesh"]
-        lowest = 0 if "mesh" in stack.edges else 1 + min(coarse)
-        active = seen.active & jnp.asarray(scene.level >= lowest)
+        active = seen.active & jnp.asarray(scene.level >= stack.lowest_level)
         keep = jnp.concatenate([active, active])[:, None]
         for index in range(stack.blocks):
             block = jax.tree.map(lambda x, i=index: x[i], stacked)

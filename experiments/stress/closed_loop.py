@@ -41,9 +41,7 @@ class Shock(NamedTuple):
     """A shock at frame `BEFORE` of a loop, and what came after."""
 
     loop: Loop
-    recovery: (
-        int | None
-    )  # frames after the shock until the energy is within `WITHIN` of the undisturbed one, and stays there
+    recovery: int | None  # frames until the energy is within `WITHIN` of the undisturbed one, and stays there
     energy: np.ndarray  # [T] J of the disturbed loop over that of the undisturbed one
 
 
