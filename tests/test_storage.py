@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from clothjax import plausibility, storage
 from clothjax.types import Body, Garment, Motion
