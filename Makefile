@@ -40,6 +40,6 @@ $(INSTALLED): pyproject.toml uv.lock
 	        echo "no Python 3.11 or newer with its venv module (tried: $(CANDIDATES))" >&2
 	        exit 1
 	    fi
-	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,export,render]'
+	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,export,render,sweep]'
 	fi
 	touch $@

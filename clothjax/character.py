@@ -42,19 +42,30 @@ class Window(NamedTuple):
     following: Frame
 
 
-def dress(scene: Scene, betas: Array, material: Material, config: PhysicsConfig) -> Character:
-    """The character of shape `betas` [S] wearing cloth of `material`."""
+def dress(scene: Scene, betas: Array | None, material: Material, config: PhysicsConfig) -> Character:
+    """The character of shape `betas` [S] wearing cloth of `material`; without betas, the shape it was modelled in.
+
+    That shape is measured once, when a program is compiled.
+    """
+    if betas is None:
+        betas = jnp.zeros(scene.body.shapedirs.shape[-1])
+        with jax.ensure_compile_time_eval():
+            *shape, areas = _shape(scene, betas, config)
+    else:
+        *shape, areas = _shape(scene, betas, config)
+    return Character(*shape, mass=areas * material.density, material=material, betas=betas)
+
+
+def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Rest, Array]:
+    """What the betas decide: template, body, joints, rest measures, and the areas [V] m^2 of the vertices."""
     template = skinning.shaped_vertices(scene.garment, betas)
     measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
-    rest = physics.rest_measures(measured, scene.mesh, flat=config.flat_hinges)
-    return Character(
-        template=template,
-        body=skinning.shaped_vertices(scene.body, betas),
-        joints=skinning.shaped_joints(scene.body, betas),
-        rest=rest,
-        mass=rest.vertex_area * material.density,
-        material=material,
-        betas=betas,
+    return (
+        template,
+        skinning.shaped_vertices(scene.body, betas),
+        skinning.shaped_joints(scene.body, betas),
+        physics.rest_measures(measured, scene.mesh, flat=config.flat_hinges),
+        physics.vertex_areas(measured, scene.garment.faces),
     )
 
 
@@ -79,6 +90,9 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
 
 def window(scene: Scene, character: Character, poses: Pose) -> Window:
     """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
+    if scene.still:
+        now = frame(scene, character, jax.tree.map(lambda x: x[1], poses))
+        return Window(now, now, now)
     frames = jax.vmap(lambda pose: frame(scene, character, pose))(poses)
 
     def at(index: int) -> Frame:

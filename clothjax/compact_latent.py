@@ -9,12 +9,13 @@ from clothjax import features as feature
 from clothjax import garment_model, graph_network, mesh_convolution, skinning
 from clothjax.character import Character, Window
 from clothjax.config import MaterialConfig, ModelConfig
-from clothjax.features import Features, Statistics
+from clothjax.features import Features, Statistics, WorldFeatures
 from clothjax.graph_network import Params, dense, init_dense, init_mlp, mlp
 from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Contact
 
 TYPE_EMBEDDING, LEVEL_EMBEDDING = 9, 4
+COLUMNS = 32  # of the Hessian at rest, computed together
 MAX_LENGTH = 4.0  # of the step, where 1 is the configured cloth's at rest: others are softer or lighter
 
 
@@ -31,7 +32,8 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
     hidden = (width,) * config.mlp_layers
     embedding = TYPE_EMBEDDING + LEVEL_EMBEDDING
     encoder = {"nodes": init_mlp(keys[0], (example.nodes.shape[-1] + embedding, *hidden))}
-    encoder["world"] = init_mlp(keys[1], (example.to_garment.shape[-1], *hidden))
+    if example.world is not None:
+        encoder["world"] = init_mlp(keys[1], (example.world.to_garment.shape[-1], *hidden))
     for index, name in enumerate(sorted(example.edges)):
         encoder[name] = init_mlp(jax.random.fold_in(keys[2], index), (example.edges[name].shape[-1], *hidden))
     left, per_vertex = latent_size(scene, config)
@@ -61,7 +63,9 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
         "type_embedding": jax.random.normal(keys[4], (4, TYPE_EMBEDDING)),
         "level_embedding": jax.random.normal(keys[5], (8, LEVEL_EMBEDDING)),
         "encoder": encoder,
-        "processor": graph_network.init_processor(keys[6], config.processor, width, config.mlp_layers),
+        "processor": graph_network.init_processor(
+            keys[6], config.processor, width, config.mlp_layers, body=example.world is not None
+        ),
         "convolution": convolution,
         "garment": garment_model.init(jax.random.fold_in(key, 9), left * per_vertex, basis, config),
     }
@@ -69,24 +73,26 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
 
 def init_statistics(example: Features) -> dict[str, Statistics]:
     """Empty statistics for features like `example`."""
-    columns = {
-        "nodes": example.nodes,
-        "mesh": next(iter(example.edges.values())),
-        "world": example.to_garment,
-    }
-    return {name: feature.empty_statistics(rows.shape[-1]) for name, rows in columns.items()}
+    return {name: feature.empty_statistics(rows[0].shape[-1]) for name, rows in _columns(example).items()}
 
 
 def observe(statistics: dict[str, Statistics], seen: Features) -> dict[str, Statistics]:
     """Statistics that have also seen a batch of features with leading axes [...]; body nodes count as nodes."""
-
-    def rows(*parts):
-        return jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
-
     return {
-        "nodes": feature.observe(statistics["nodes"], rows(seen.nodes, seen.body)),
-        "mesh": feature.observe(statistics["mesh"], rows(*seen.edges.values())),
-        "world": feature.observe(statistics["world"], rows(seen.to_garment, seen.to_body)),
+        name: feature.observe(statistics[name], jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in parts]))
+        for name, parts in _columns(seen).items()
+    }
+
+
+def _columns(seen: Features) -> dict[str, list[Array]]:
+    """The features that share columns, and so statistics."""
+    world = seen.world
+    if world is None:
+        return {"nodes": [seen.nodes], "mesh": list(seen.edges.values())}
+    return {
+        "nodes": [seen.nodes, world.nodes],
+        "mesh": list(seen.edges.values()),
+        "world": [world.to_garment, world.to_body],
     }
 
 
@@ -106,28 +112,31 @@ def pass_messages(
         embedded = jnp.concatenate([kinds[kind], params["level_embedding"][level]], axis=-1)
         return mlp(encoder["nodes"], jnp.concatenate([rows, embedded], axis=-1))
 
-    rows = feature.normalise(statistics["nodes"], seen.nodes)
-    garment = nodes(rows, 3 * pinned, jnp.asarray(scene.level))
-    ones = jnp.ones_like(pinned)
-    body = nodes(feature.normalise(statistics["nodes"], seen.body), ones, 0 * ones)
+    garment = nodes(feature.normalise(statistics["nodes"], seen.nodes), 3 * pinned, jnp.asarray(scene.level))
     edges = {name: mlp(encoder[name], feature.normalise(statistics["mesh"], e)) for name, e in seen.edges.items()}
-    world = {"to_garment": mlp(encoder["world"], feature.normalise(statistics["world"], seen.to_garment))}
-    updated = config.body_nodes == "updated"
-    if updated:
-        world["to_body"] = mlp(encoder["world"], feature.normalise(statistics["world"], seen.to_body))
     return graph_network.process(
         params["processor"],
         config.processor,
         garment,
-        body,
         edges,
-        world,
+        _world(encoder, nodes, statistics, seen.world, config),
         scene.graph,
-        seen.slots,
-        _active(scene, seen, config),
-        update_body=updated,
+        scene.level,
         remat=config.remat,
     )
+
+
+def _world(encoder: Params, nodes: Callable, statistics: dict[str, Statistics], seen: WorldFeatures | None, config):
+    """The body and its pairs with the garment, encoded."""
+    if seen is None:
+        return None
+    rows = feature.normalise(statistics["nodes"], seen.nodes)
+    ones = jnp.ones(len(rows), jnp.int32)
+    directions = {"to_garment": seen.to_garment}
+    if config.body_nodes == "updated":
+        directions["to_body"] = seen.to_body
+    pairs = {name: mlp(encoder["world"], feature.normalise(statistics["world"], x)) for name, x in directions.items()}
+    return graph_network.World(nodes(rows, ones, 0 * ones), seen.slots, seen.active, pairs)
 
 
 def convolve(params: Params, scene: Scene, processed: Array, config: ModelConfig) -> Array:
@@ -179,7 +188,11 @@ def inverse_hessian(potential: Callable[[Array], Array], garment: Params, size: 
     def energy(latent):
         return potential(garment_model.displacement(garment, latent, free, config))
 
-    values, vectors = jnp.linalg.eigh(jax.hessian(energy)(jnp.zeros(size)))
+    def column(direction):
+        return jax.jvp(jax.grad(energy), (jnp.zeros(size),), (direction,))[1]
+
+    # some at a time: of a large garment all together would not fit into memory
+    values, vectors = jnp.linalg.eigh(jax.lax.map(column, jnp.eye(size), batch_size=COLUMNS))
     inverse = 1.0 / (jnp.maximum(values, 0.0) + config.descent_damping)
     return jnp.matmul(vectors * inverse[None], vectors.T, precision="highest")
 
@@ -191,7 +204,7 @@ def step(
     character: Character,
     state: ClothState,
     window: Window,
-    contact: Contact,
+    contact: Contact | None,
     timestep: Array,
     potential: Callable[[Array], Array],
     model: ModelConfig,
@@ -231,11 +244,3 @@ def decode(params: Params, scene: Scene, character: Character, latent: Array, wi
     free = 1.0 - jnp.asarray(scene.garment.pinned).astype(latent.dtype)
     displaced = garment_model.displacement(params["garment"], latent, free, model)
     return garment_model.vertices(displaced, character.template, window.following.garment)
-
-
-def _active(scene: Scene, seen: Features, config: ModelConfig) -> dict[str, Array]:
-    """Which pairs pass messages in each stack: those at vertices that have edges in it."""
-    return {
-        str(index): seen.active & jnp.asarray(scene.level >= stack.lowest_level)
-        for index, stack in enumerate(config.processor)
-    }

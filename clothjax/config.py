@@ -38,10 +38,20 @@ class MaterialConfig:
     """Draw materials from the ranges in training; false keeps the single values."""
 
 
+Energy = Literal["stretching", "bending", "gravity", "inertia", "friction", "collision"]
+
+
 @dataclass(frozen=True)
 class PhysicsConfig:
-    """Constants of the energies that do not belong to the cloth."""
+    """What acts on the cloth, and the constants that do not belong to it.
 
+    What is not there is not in the compiled programs either: training, Phi and the reference solver alike.
+    """
+
+    body: Literal["moving", "still", "none"] = "moving"
+    """Whether there is a body to touch, and whether it moves. Where there is none, the rig only carries the pins."""
+    without: tuple[Energy, ...] = ()
+    """Energies that the scene does not have."""
     collision_stiffness: float = 1e5  # J/m^3, of the cubic penetration
     collision_offset: float = 3e-3  # m
     friction_coefficient: float = 0.5
@@ -67,6 +77,7 @@ class PhysicsConfig:
             self.contact_surface == "triangles" or not self.edge_contact,
             "edge_contact needs contact_surface: triangles; set edge_contact: false",
         )
+        _require(len(set(self.without)) == len(self.without), f"without names an energy twice: {self.without}")
 
 
 @dataclass(frozen=True)

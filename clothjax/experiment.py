@@ -38,7 +38,15 @@ def motion(experiment: Experiment, name: str) -> Motion:
             f"{name} has {clip.fps} frames a second, the experiment {experiment.config.fps}; "
             "resample the clip when importing it (data_prep), or set `fps`"
         )
+    if experiment.scene.still and not _stands(clip):
+        raise ValueError(f"{name} moves, but physics.body is `still`: give a clip of one pose, or set it to `moving`")
     return clip
+
+
+def _stands(clip: Motion) -> bool:
+    return all(
+        np.abs(np.asarray(part) - np.asarray(part[:1])).max() < 1e-6 for part in (clip.rotations, clip.translation)
+    )
 
 
 def training_motions(config: Config) -> tuple[str, ...]:

@@ -23,16 +23,22 @@ class Statistics(NamedTuple):
     count: Array  # rows seen
 
 
+class WorldFeatures(NamedTuple):
+    """Of the body: nodes, and pairs of a garment vertex with the body vertex nearest to it."""
+
+    nodes: Array  # [S, N], a slot for every body vertex that may be nearest to some garment vertex
+    slots: Array  # [V] int32, the slot of each garment vertex
+    active: Array  # [V] bool, whether the pair is close enough to count
+    to_garment: Array  # [V, W]
+    to_body: Array  # [V, W] the same pair in the other direction
+
+
 class Features(NamedTuple):
     """Raw inputs of the encoders."""
 
     nodes: Array  # [V, N]
-    body: Array  # [V, N], one slot for each garment vertex at the most
     edges: dict[str, Array]  # [E, M] by edge set
-    to_garment: Array  # [V, W] of the pair (garment vertex, its nearest body vertex)
-    to_body: Array  # [V, W] the same pair in the other direction
-    slots: Array  # [V] int32, the body slot of each garment vertex
-    active: Array  # [V] bool, whether the pair is close enough to count
+    world: WorldFeatures | None  # None where there is no body
 
 
 def features(
@@ -40,7 +46,7 @@ def features(
     character: Character,
     state: ClothState,
     window: Window,
-    contact: Contact,
+    contact: Contact | None,
     timestep: Array,
     held: Array,
     force: Array,
@@ -50,60 +56,69 @@ def features(
     """The inputs of Phi for one step: HOOD's, plus positions and accelerations (method: X_H+).
 
     Args:
-        contact: planes at the body points nearest to the garment now.
+        contact: planes at the body points nearest to the garment now; None where there is no body.
         timestep: s.
         held: [V, 3] m, the next positions if the canonical displacement were kept.
         force: [V, 3] N on the garment there, minus the potential's gradient.
     """
-    current, following = window.current, window.following
-    turn = current.heading.T
-    count = scene.garment.vertices.shape[0]
+    turn = window.current.heading.T
     inputs = material_inputs(character.material, material)
 
-    # body nodes: the distinct nearest vertices, in slots
-    vertices, slots = jnp.unique(contact.index, size=count, fill_value=0, return_inverse=True)
-    slots = slots.astype(jnp.int32).reshape(-1)
-    body_now, body_next = current.body[vertices], following.body[vertices]
-    body_before = window.previous.body[vertices]
-
     def node(velocity, acceleration, normal, position, log_mass, materials):
-        shared = [velocity, acceleration, normal, position - current.root[None]]
+        shared = [velocity, acceleration, normal, position - window.current.root[None]]
         columns = [_rotate(turn, part) for part in shared]
+        count = len(position)
+        materials = jnp.broadcast_to(materials[None], (count, *materials.shape))
         return jnp.concatenate([*columns, _column(jnp.asarray(timestep), count), log_mass[:, None], materials], axis=-1)
 
     garment = node(
         state.velocity,
         state.acceleration,
-        skinning.vertex_normals(state.position, scene.mesh.faces),
+        skinning.vertex_normals(state.position, scene.garment.faces),
         state.position,
         jnp.log(character.mass),
-        jnp.broadcast_to(inputs[None], (count, 3)),
+        inputs,
     )
-    body = node(
-        body_now - body_before,
-        body_next - 2 * body_now + body_before,
-        current.normals[vertices],
-        body_now,
-        -jnp.ones_like(character.mass),
-        -jnp.ones((count, 3), body_now.dtype),
-    )
-
     edge_points = {"now": state.position}
+    extra = jnp.zeros((len(garment), 0), garment.dtype)
     if model.canonical_features:
         extra, drifted = _canonical(character, state, window, contact, held, force)
-        garment = jnp.concatenate([garment, extra], axis=-1)
-        body = jnp.concatenate([body, jnp.zeros_like(extra)], axis=-1)
         edge_points |= {"held": held, "drifted": drifted}
     edges = {
         name: mesh_edges(senders, receivers, edge_points, character.template, turn, timestep, inputs)
         for name, (senders, receivers) in scene.graph.items()
     }
+    world = None
+    if contact is not None:
+        world = _world(state, window, contact, timestep, node, inputs, extra.shape[-1], model.body_radius)
+    return Features(jnp.concatenate([garment, extra], axis=-1), edges, world)
 
-    offset_now = state.position - current.body[contact.index]
-    offset_next = state.position - following.body[contact.index]
+
+def _world(
+    state: ClothState, window: Window, contact: Contact, timestep: Array, node, inputs: Array, extra: int, radius: float
+) -> WorldFeatures:
+    """Of the body, as the garment's: `node` makes rows, which get `extra` columns of zeros."""
+    bodies = [frame.body for frame in window]
+    before, now, following = bodies
+    normals, nearest, slots = window.current.normals, contact.index, contact.index
+    if len(now) > len(nearest):  # the distinct ones, in slots
+        vertices, slots = jnp.unique(nearest, size=len(nearest), fill_value=0, return_inverse=True)
+        slots = slots.astype(jnp.int32).reshape(-1)
+        before, now, following, normals = (x[vertices] for x in (before, now, following, normals))
+    nodes = node(
+        now - before, following - 2 * now + before, normals, now, -jnp.ones_like(now[:, 0]), -jnp.ones_like(inputs)
+    )
+    offset_now = state.position - bodies[1][nearest]
+    offset_next = state.position - bodies[2][nearest]
+    turn = window.current.heading.T
     to_body, to_garment = world_edges(offset_now, offset_next, turn, timestep)
-    active = jnp.sum(offset_now * offset_now, axis=-1) <= model.body_radius**2
-    return Features(garment, body, edges, to_garment, to_body, slots, active)
+    return WorldFeatures(
+        nodes=jnp.pad(nodes, ((0, 0), (0, extra))),
+        slots=slots,
+        active=jnp.sum(offset_now * offset_now, axis=-1) <= radius**2,
+        to_garment=to_garment,
+        to_body=to_body,
+    )
 
 
 def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
@@ -124,7 +139,9 @@ def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Ar
 
 
 def material_inputs(material: Material, config: MaterialConfig) -> Array:
-    """Bending, mu and lambda [3] scaled to [0, 1] over their training ranges (HOOD's order)."""
+    """Bending, mu and lambda [3] scaled to [0, 1] over their training ranges (HOOD's order); [0] if they are fixed."""
+    if not config.sample:
+        return jnp.zeros(0)
     pairs = (
         (material.bending, config.bending_range),
         (material.mu, config.mu_range),
@@ -143,7 +160,9 @@ def scaled(value: Array, limits) -> Array:
     return (value - limits.low) / (limits.high - limits.low)
 
 
-def _canonical(character: Character, state: ClothState, window: Window, contact: Contact, held: Array, force: Array):
+def _canonical(
+    character: Character, state: ClothState, window: Window, contact: Contact | None, held: Array, force: Array
+):
     """The state as the next frame's canonical pose sees it, [V, 22]; and where it would be if nothing pushed.
 
     `held` keeps the canonical displacement, `drifted` keeps the velocity: the two guesses between which, roughly,
@@ -154,8 +173,6 @@ def _canonical(character: Character, state: ClothState, window: Window, contact:
     displacement = skinning.unapply(window.current.garment, state.position) - character.template
     drifted = state.position + state.velocity
     down = jnp.zeros_like(drifted).at[:, 1].set(-1.0)
-    gap_held = contacts.distance(held, contact.point_next, contact.normal_next)
-    gap_drifted = contacts.distance(drifted, contact.point_next, contact.normal_next)
     pull = force / (physics.GRAVITY * character.mass[:, None])
     size = _length(pull)
     pull = pull * jnp.where(size > 1e-6, jnp.arcsinh(size) / jnp.maximum(size, 1e-6), 1.0)
@@ -164,13 +181,13 @@ def _canonical(character: Character, state: ClothState, window: Window, contact:
         skinning.unapply_direction(following, pull),
         skinning.unapply(following, drifted) - character.template,
         skinning.unapply_direction(following, down),
-        skinning.unapply_direction(following, contact.normal_next),
         character.template,
-        jnp.clip(gap_held, -0.05, 0.05)[:, None],
-        jnp.clip(gap_drifted, -0.05, 0.05)[:, None],
-        jnp.maximum(0.003 - gap_held, 0.0)[:, None],
-        jnp.maximum(0.003 - gap_drifted, 0.0)[:, None],
     ]
+    if contact is not None:
+        columns.append(skinning.unapply_direction(following, contact.normal_next))
+        gaps = [contacts.distance(x, contact.point_next, contact.normal_next)[:, None] for x in (held, drifted)]
+        columns += [jnp.clip(gap, -0.05, 0.05) for gap in gaps]
+        columns += [jnp.maximum(0.003 - gap, 0.0) for gap in gaps]
     return jnp.concatenate(columns, axis=-1), drifted
 
 
@@ -179,7 +196,7 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
 
     Args:
         points: [V, 3] m by name: `now`, and the guesses `held` and `drifted` where there are any.
-        template: [V, 3] m, at rest; turn: [3, 3] into the frame of the features; inputs: [3] the material.
+        template: [V, 3] m, at rest; turn: [3, 3] into the frame of the features; inputs: [3] the material, or [0].
     """
     rest = template[senders] - template[receivers]
     rest_length = _length(rest)
@@ -191,7 +208,7 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
             columns += [_length(vector) / rest_length - 1.0]
     columns += [
         _column(jnp.asarray(timestep), len(senders)),
-        jnp.broadcast_to(inputs[None], (len(senders), 3)),
+        jnp.broadcast_to(inputs[None], (len(senders), *inputs.shape)),
     ]
     return jnp.concatenate(columns, axis=-1)
 

@@ -1,9 +1,12 @@
 """Encoder MLPs and message-passing blocks on several edge sets (HOOD; Pfaff et al. 2021)."""
 
+from typing import Any, NamedTuple
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import jraph
+import numpy as np
 
 from clothjax.config import Stack
 from clothjax.types import Array, EdgeSet
@@ -79,12 +82,12 @@ _affine.defvjp(_affine_forward, _affine_backward)
 # --- message passing ----------------------------------------------------------------------------------------------
 
 
-def init_processor(key: Array, stacks: tuple[Stack, ...], width: int, layers: int) -> list[Params]:
+def init_processor(key: Array, stacks: tuple[Stack, ...], width: int, layers: int, body: bool = True) -> list[Params]:
     """Parameters of each stack of blocks, stacked along a leading axis so that depth is a scan."""
     hidden = (width,) * layers
 
     def block(key: Array, edges: tuple[str, ...]) -> Params:
-        names = sorted((*edges, "world"))
+        names = sorted((*edges, "world") if body else edges)
         keys = jax.random.split(key, len(names) + 1)
         params = {f"edge_{name}": init_mlp(k, (3 * width, *hidden)) for name, k in zip(names, keys[1:])}
         params["node"] = init_mlp(keys[0], ((1 + len(names)) * width, *hidden))
@@ -97,71 +100,92 @@ def init_processor(key: Array, stacks: tuple[Stack, ...], width: int, layers: in
     ]
 
 
+class World(NamedTuple):
+    """The body beside a garment, and the pairs of a garment vertex with the body node nearest to it."""
+
+    nodes: Array  # [S, W] latents of the body nodes
+    slots: Array  # [V] int32, the body node of each garment vertex
+    active: Array  # [V] bool, the pairs that pass messages
+    pairs: dict[str, Array]  # latents [V, W]: `to_garment`, and `to_body` if body nodes are to be updated
+
+
 def process(
     params: list[Params],
     stacks: tuple[Stack, ...],
     nodes: Array,
-    body: Array,
     edges: dict[str, Array],
-    world: dict[str, Array],
+    world: World | None,
     graph: dict[str, EdgeSet],
-    slots: Array,
-    active: dict[str, Array],
+    level: np.ndarray,
     *,
-    update_body: bool,
     remat: bool,
 ) -> Array:
     """Garment node latents [V, W] after all message-passing blocks.
 
+    In a stack without the fine mesh only the vertices of its coarse levels send and receive, from the body too; the
+    others go through the node MLP alone.
+
     Args:
         params: of `init_processor`.
-        nodes: [V, W] garment, body: [V, W] latents of body nodes, one slot each.
+        nodes: [V, W] of the garment.
         edges: latents [E, W] by edge set, on `graph`.
-        world: latents [V, W] of the pairs (garment vertex i, body slot slots[i]): `to_garment`, and `to_body` if
-            body nodes are updated.
-        active: [V] bool by stack (its index as a string): the pairs that pass messages in it.
+        world: None where there is no body.
+        level: [V] the deepest coarse level of a vertex, plus one; 0 for none.
     """
-    for index, (stack, stacked) in enumerate(zip(stacks, params)):
-        mask = active[str(index)]
+    body, pairs = (None, {}) if world is None else (world.nodes, world.pairs)
+    for stack, stacked in zip(stacks, params):
+        rows, among = _reached(stack, graph, level)
+        slots, active = (None, None) if world is None else (world.slots[rows], world.active[rows])
 
-        def block(carry, p, stack=stack, mask=mask):
-            nodes, body, edges, world = carry
-            nodes, body, updated, world = _block(
-                p, nodes, body, {k: edges[k] for k in stack.edges}, world, graph, slots, mask, update_body
-            )
-            return (nodes, body, edges | updated, world), None
+        def block(carry, p, rows=rows, among=among, slots=slots, active=active):
+            return _block(p, *carry, rows, among, slots, active), None
 
         if remat:
             block = jax.checkpoint(block, prevent_cse=False)
-        (nodes, body, edges, world), _ = jax.lax.scan(block, (nodes, body, edges, world), stacked)
+        carry = (nodes, body, {name: edges[name] for name in stack.edges}, {k: x[rows] for k, x in pairs.items()})
+        (nodes, body, updated, near), _ = jax.lax.scan(block, carry, stacked)
+        edges = edges | updated
+        pairs = {name: x.at[rows].set(near[name]) for name, x in pairs.items()}
     return nodes
 
 
-def _block(params, nodes, body, edges, world, graph, slots, mask, update_body):
-    """One residual block. The first layer of each message MLP is applied to nodes before they are gathered."""
-    count, width = nodes.shape
-    received = {}
-    updated = {}
+def _reached(stack: Stack, graph: dict[str, EdgeSet], level: np.ndarray) -> tuple[Any, dict[str, EdgeSet]]:
+    """Which vertices have edges in a stack, and its edges, numbered among these."""
+    if stack.lowest_level == 0:
+        return slice(None), {name: graph[name] for name in stack.edges}
+    reached = np.asarray(level) >= stack.lowest_level
+    number = np.cumsum(reached, dtype=np.int32) - 1
+    return np.flatnonzero(reached), {name: EdgeSet(*(number[ends] for ends in graph[name])) for name in stack.edges}
+
+
+def _block(params, nodes, body, edges, pairs, rows, graph, slots, active):
+    """One residual block. First layers are applied before what they read is gathered or put side by side."""
+    here, new_body = nodes[rows], body
+    arrived, new_edges, new_pairs = {}, {}, {}
     for name, latent in edges.items():
         senders, receivers = graph[name]
-        message = _message(params[f"edge_{name}"], nodes, nodes, latent, receivers, senders)
-        received[name] = jraph.segment_sum(message, receivers, count, indices_are_sorted=True)
-        updated[name] = latent + message
-    pairs = params["edge_world"]
-    keep = mask[:, None]
-    message = _message(pairs, nodes, body, world["to_garment"], None, slots)
-    received["world"] = jnp.where(keep, message, 0.0)
-    new_world = {"to_garment": jnp.where(keep, world["to_garment"] + message, world["to_garment"])}
-    new_body = body
-    if update_body:
-        back = _message(pairs, body, nodes, world["to_body"], slots, None)
-        at_body = jraph.segment_sum(jnp.where(keep, back, 0.0), slots, count)
-        new_world["to_body"] = jnp.where(keep, world["to_body"] + back, world["to_body"])
-        empty = jnp.zeros((count, width * len(updated)), nodes.dtype)
-        new_body = body + mlp(params["node"], jnp.concatenate([body, empty, at_body], axis=-1))
-    arrived = [received[name] for name in sorted(received)]
-    new_nodes = nodes + mlp(params["node"], jnp.concatenate([nodes, *arrived], axis=-1))
-    return new_nodes, new_body, updated, new_world
+        message = _message(params[f"edge_{name}"], here, here, latent, receivers, senders)
+        arrived[name] = jraph.segment_sum(message, receivers, len(here), indices_are_sorted=True)
+        new_edges[name] = latent + message
+    if "to_garment" in pairs:
+        message = _message(params["edge_world"], here, body, pairs["to_garment"], None, slots)
+        arrived["world"] = jnp.where(active[:, None], message, 0.0)
+        new_pairs["to_garment"] = pairs["to_garment"] + arrived["world"]
+    if "to_body" in pairs:
+        message = _message(params["edge_world"], body, here, pairs["to_body"], slots, None)
+        back = jnp.where(active[:, None], message, 0.0)
+        new_pairs["to_body"] = pairs["to_body"] + back
+        at_body = jraph.segment_sum(back, slots, len(body))
+        new_body = body + _node_update(params["node"], body, slice(None), at_body)
+    everything = jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1)
+    return nodes + _node_update(params["node"], nodes, rows, everything), new_body, new_edges, new_pairs
+
+
+def _node_update(params: Params, nodes: Array, rows: Any, arrived: Array) -> Array:
+    """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
+    kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
+    own = nodes @ kernel[: nodes.shape[-1]] + bias[None]
+    return _mlp_tail(params, own.at[rows].add(arrived @ kernel[-arrived.shape[-1] :]))
 
 
 def _message(params, targets, sources, latent, target_index, source_index):

@@ -13,7 +13,7 @@ from clothjax import features as feature
 from clothjax import graph_network, proximity, skinning
 from clothjax.config import Stack
 from clothjax.features import Statistics
-from clothjax.graph_network import Params, init_mlp, mlp
+from clothjax.graph_network import Params, World, init_mlp, mlp
 from clothjax.types import Array, EdgeSet
 
 NORMAL, BODY, OMITTED, PINNED = range(4)  # rows of the type embedding; the others are not used
@@ -167,13 +167,10 @@ def step(
         params["processor"],
         SCHEDULE,
         nodes[:count],
-        nodes[count:],
         {name: mlp(encoder[name], rows) for name, rows in edges.items()},
-        {"to_body": world[:count], "to_garment": world[count:]},
+        World(nodes[count:], slots, active, {"to_body": world[:count], "to_garment": world[count:]}),
         cloth.graph,
-        slots,
-        {str(index): active & (cloth.level >= stack.lowest_level) for index, stack in enumerate(SCHEDULE)},
-        update_body=True,
+        cloth.level,
         remat=False,
     )
     output = mlp(params["decoder"], processed)

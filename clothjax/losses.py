@@ -18,8 +18,8 @@ class TimeStep(NamedTuple):
     mass: Array  # [V] kg
     rest: Rest
     material: Material
-    contact: Contact
-    touching: Array  # [V] bool, in contact now
+    contact: Contact | None  # None where there is no body
+    touching: Array | None  # [V] bool, in contact now; None where there is no friction
     timestep: Array  # s
     edge_contact: EdgeContact | None = None
     self_contact: SelfContact | None = None
@@ -37,35 +37,45 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
     """
     moved = new - step.position
     contact = step.contact
-    normal = contact.normal + contact.normal_next
-    length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
     terms = {
-        "stretching": physics.stretching(
+        "stretching": lambda: physics.stretching(
             new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
         ),
-        "bending": physics.bending(
+        "bending": lambda: physics.bending(
             new[mesh.hinges], step.rest.hinge_area, step.rest.hinge_angle, step.material.bending
         ),
         # the height gained in the step: the same force as the height, without its large constant
-        "gravity": physics.gravity(moved[:, 1], step.mass),
-        "inertia": physics.inertia(moved - step.velocity, step.mass, step.timestep),
-        "friction": physics.friction(
+        "gravity": lambda: physics.gravity(moved[:, 1], step.mass),
+        "inertia": lambda: physics.inertia(moved - step.velocity, step.mass, step.timestep),
+    }
+    if step.touching is not None:
+        terms["friction"] = lambda: physics.friction(
             moved - (contact.point_next - contact.point),
-            normal / length,
+            _mean_direction(contact.normal, contact.normal_next),
             step.mass,
             step.touching,
             config.friction_coefficient,
             config.friction_smoothing,
-        ),
-        "collision": config.collision_stiffness
-        * physics.collision(contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset),
-    }
+        )
+    if contact is not None:
+        terms["collision"] = lambda: (
+            config.collision_stiffness
+            * physics.collision(
+                contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset
+            )
+        )
+    terms = {name: term() for name, term in terms.items() if name not in config.without}
     if step.edge_contact is not None:
         terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config)
     if step.self_contact is not None:
         points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
         terms["self_collision"] = self_collision(points, step.self_contact, config)
     return terms
+
+
+def _mean_direction(one: Array, other: Array) -> Array:
+    total = one + other
+    return total / jnp.sqrt(jnp.maximum(jnp.sum(total * total, axis=-1, keepdims=True), 1e-12))
 
 
 def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig) -> Array:
@@ -94,10 +104,14 @@ def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> 
     return sum(energies(new, step, mesh, config).values())
 
 
+def present(terms: dict[str, Array], config: LossConfig) -> dict[str, Array]:
+    """The terms whose weight is not always zero: the others are then not computed."""
+    return {name: value for name, value in terms.items() if not getattr(config, name).absent}
+
+
 def weighted(terms: dict[str, Array], config: LossConfig, training_step: Array) -> Array:
-    """The training loss: the weighted sum of terms in J over `config.scale`; absent terms are not computed."""
-    ramps = {name: getattr(config, name) for name in terms}
-    total = sum(weight(ramp, training_step) * terms[name] for name, ramp in ramps.items() if not ramp.absent)
+    """The training loss: the weighted sum of terms in J over `config.scale`."""
+    total = sum(weight(getattr(config, name), training_step) * value for name, value in terms.items())
     return total / config.scale
 
 

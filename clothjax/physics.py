@@ -39,8 +39,14 @@ def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:
         face_area=face_area,
         hinge_area=_triangle_areas(vertices[mesh.hinges]),
         hinge_angle=jnp.zeros_like(angle) if flat else angle,
-        vertex_area=jnp.zeros_like(vertices[:, 0]).at[mesh.faces.reshape(-1)].add(jnp.repeat(face_area / 3.0, 3)),
     )
+
+
+def vertex_areas(vertices: Array, faces: Array) -> Array:
+    """Area [V] m^2 that belongs to each vertex [V, 3] m: a third of its faces [F, 3]."""
+    corners = vertices[faces]
+    areas = 0.5 * _norm(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return jnp.zeros_like(vertices[:, 0]).at[faces.reshape(-1)].add(jnp.repeat(areas / 3.0, 3))
 
 
 def green_strain(corners: Array, inverse: Array) -> Array:

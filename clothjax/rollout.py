@@ -42,12 +42,14 @@ def time_step(
     """The incremental potential's constants for the step from `window.current` to `window.following`."""
     physics = config.physics
     body, body_next = window.current.body, window.following.body
-    at_edges = on_self = None
-    if physics.contact_surface == "triangles":
+    planes = near = at_edges = on_self = None
+    if scene.touchable and physics.contact_surface == "triangles":
         planes = contact.find(state.position, body, body_next, scene.patches)
-    else:
+    elif scene.touchable:
         planes = contact.find_at_centroids(state.position, body, body_next, scene.body.faces)
-    if physics.edge_contact:
+    if planes is not None and "friction" not in physics.without:
+        near = losses.touching(state.position, planes, physics.friction_radius)
+    if planes is not None and physics.edge_contact:
         at_edges = contact.find_at_edges(state.position, planes, scene.mesh, body, body_next, scene.patches)
     if physics.self_contact:
         on_self = contact.find_on_self(state.position, scene.garment_patches)
@@ -58,7 +60,7 @@ def time_step(
         rest=character.rest,
         material=character.material,
         contact=planes,
-        touching=losses.touching(state.position, planes, physics.friction_radius),
+        touching=near,
         timestep=jnp.asarray(timestep, state.position.dtype),
         edge_contact=at_edges,
         self_contact=on_self,
@@ -140,7 +142,7 @@ def training_rollout(
         taken, (new, step, seen) = take(
             model, scene, character, state._replace(velocity=velocity), window, timestep, config
         )
-        terms = losses.energies(new, step, scene.mesh, config.physics)
+        terms = losses.present(losses.energies(new, step, scene.mesh, config.physics), config.loss)
         loss = losses.weighted(terms, config.loss, training_step)
         taken = taken._replace(
             velocity=jnp.where(fresh, state.velocity, taken.velocity),

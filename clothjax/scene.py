@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
 from scipy.spatial import cKDTree
 
 from clothjax import graph_sampling, topology
@@ -26,13 +28,19 @@ class Scene(NamedTuple):
     """The fixed part of a simulation."""
 
     garment: Garment
-    body: Body  # only the vertices that the garment can reach
-    mesh: Mesh
+    body: Body  # only the vertices that the garment can reach; none where there is no body to touch
+    still: bool  # whether the body never moves
+    mesh: Mesh  # what has energy: of faces, hinges and edges those with a vertex that is not pinned
     graph: dict[str, EdgeSet]  # `mesh`, and the coarse levels in use
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]
-    patches: Patches  # of the body
+    patches: Patches | None  # of the body
     garment_patches: Patches
+
+    @property
+    def touchable(self) -> bool:
+        """Whether there is a body to touch."""
+        return self.patches is not None
 
 
 def build(garment: Garment, body: Body, config: Config) -> Scene:
@@ -55,15 +63,18 @@ def build(garment: Garment, body: Body, config: Config) -> Scene:
         strides=[level.stride for level in config.model.convolution],
         radii=[level.radius for level in config.model.convolution],
     )
-    within = reachable(body, garment, config.physics.reach)
+    touchable = config.physics.body != "none"
+    within = reachable(body, garment, config.physics.reach) if touchable else _bare(body)
+    mesh, free = topology.mesh(faces, len(garment.vertices)), ~np.asarray(garment.pinned)
     return Scene(
         garment=garment,
         body=within,
-        mesh=topology.mesh(faces, len(garment.vertices)),
+        still=config.physics.body == "still",
+        mesh=Mesh(*(elements[free[elements].any(axis=1)] for elements in mesh)),
         graph=graph,
         level=graph_sampling.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
-        patches=patches(within.vertices, within.faces),
+        patches=patches(within.vertices, within.faces) if touchable else None,
         garment_patches=patches(garment.vertices, faces),
     )
 
@@ -94,9 +105,18 @@ def reachable(body: Body, garment: Garment, reach: float) -> Body:
     kept = np.unique(kept_faces)
     renumbered = np.full(len(inside), -1, np.int32)
     renumbered[kept] = np.arange(len(kept), dtype=np.int32)
+    return _part(body, kept, renumbered[kept_faces])
+
+
+def _bare(body: Body) -> Body:
+    """The rig of a body alone."""
+    return _part(body, np.zeros(0, np.int32), np.zeros((0, 3), np.int32))
+
+
+def _part(body: Body, kept: np.ndarray, faces: np.ndarray) -> Body:
     return body._replace(
         vertices=body.vertices[kept],
-        faces=renumbered[kept_faces],
+        faces=faces,
         weights=body.weights[kept],
         shapedirs=body.shapedirs[kept],
         posedirs=None if body.posedirs is None else body.posedirs[kept],
@@ -121,13 +141,20 @@ def laplacian_basis(scene: Scene, count: int, stiffness: float, density: float, 
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     mass = np.zeros(len(vertices))
     np.add.at(mass, np.asarray(scene.garment.faces).ravel(), np.repeat(area * density / 3, 3))
-    laplacian = np.zeros((len(vertices), len(vertices)))
-    laplacian[edges[:, 0], edges[:, 1]] = laplacian[edges[:, 1], edges[:, 0]] = -stiffness
-    np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
+    ends = np.concatenate([edges, edges[:, ::-1]]).T
+    springs = scipy.sparse.coo_array((np.full(2 * len(edges), stiffness), ends), shape=(len(vertices),) * 2)
+    laplacian = (scipy.sparse.diags_array(springs.sum(axis=1)) - springs).tocsc()[free][:, free]
     modes = min(-(-count // 3), len(free))
-    values, vectors = scipy.linalg.eigh(
-        laplacian[np.ix_(free, free)], np.diag(mass[free]), subset_by_index=[0, modes - 1]
-    )
+    if modes < len(free) // 2:
+        values, vectors = scipy.sparse.linalg.eigsh(
+            laplacian,
+            modes,
+            scipy.sparse.diags_array(mass[free]).tocsc(),
+            sigma=-1 / timestep**2,
+            v0=np.random.default_rng(0).standard_normal(len(free)),
+        )
+    else:
+        values, vectors = scipy.linalg.eigh(laplacian.toarray(), np.diag(mass[free]), subset_by_index=[0, modes - 1])
     scaled = vectors / np.sqrt(np.maximum(values, 0) + 1 / timestep**2)
     basis = np.zeros((modes, 3, len(vertices), 3))
     for axis in range(3):

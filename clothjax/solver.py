@@ -117,7 +117,7 @@ def solve_step(
     x = np.array(new0, np.float64)
     step = jax.tree.map(to_float64, step)
     _check(x, step)
-    mesh = jax.tree.map(np.asarray, mesh)
+    step, mesh = _present(step, jax.tree.map(np.asarray, mesh), config)
     pattern = structure(step, mesh)
     free = np.broadcast_to(~np.asarray(pinned, bool)[:, None], x.shape)
     weight = max(float(np.linalg.norm(physics.GRAVITY * step.mass[free[:, 0]])), np.finfo(np.float64).tiny)
@@ -140,6 +140,18 @@ def solve_step(
         stretch, depth = (float(value) for value in _condition(x, step, mesh, free[:, 0]))
     norm = float(np.linalg.norm(gradient))
     return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy, stretch, depth)
+
+
+def _present(step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[TimeStep, Mesh]:
+    """The step and the mesh without the elements of energies that the scene does not have."""
+    rest = step.rest
+    if "stretching" in config.without:
+        mesh = mesh._replace(faces=mesh.faces[:0])
+        rest = rest._replace(inverse=rest.inverse[:0], face_area=rest.face_area[:0])
+    if "bending" in config.without:
+        mesh = mesh._replace(hinges=mesh.hinges[:0])
+        rest = rest._replace(hinge_area=rest.hinge_area[:0], hinge_angle=rest.hinge_angle[:0])
+    return step._replace(rest=rest), mesh
 
 
 def hessians(
@@ -168,10 +180,11 @@ def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfi
     def hinge_energy(points, area, angle):
         return physics.bending(points[None], area[None], angle[None], material.bending)[0]
 
-    def vertex_gradient(new):
-        return jax.grad(lambda y: sum(jnp.sum(losses.elements(y, step, mesh, config)[name]) for name in VERTEX_TERMS))(
-            new
-        )
+    def vertex_energy(new):
+        elements = losses.elements(new, step, mesh, config)
+        return sum((jnp.sum(elements[name]) for name in VERTEX_TERMS if name in elements), jnp.zeros((), x.dtype))
+
+    vertex_gradient = jax.grad(vertex_energy)
 
     # every vertex term depends on one vertex only, so three directions give all 3 x 3 blocks
     axes = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, :], (3, *x.shape))
@@ -268,10 +281,12 @@ def _condition(x: Array, step: TimeStep, mesh: Mesh, free: Array) -> tuple[Array
     strain = physics.green_strain(x[mesh.faces], step.rest.inverse)
     mean, spread = 0.5 * (strain[:, 0, 0] + strain[:, 1, 1]), 0.5 * (strain[:, 0, 0] - strain[:, 1, 1])
     largest = mean + jnp.sqrt(spread * spread + strain[:, 0, 1] * strain[:, 0, 1])
-    distance = contact.distance(x, step.contact.point_next, step.contact.normal_next)
-    return jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest), 0.0)), jnp.max(
-        jnp.where(free, -distance, 0.0), initial=0.0
-    )
+    stretch = jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest, initial=0.0), 0.0))
+    depth = jnp.zeros((), x.dtype)
+    if step.contact is not None:
+        distance = contact.distance(x, step.contact.point_next, step.contact.normal_next)
+        depth = jnp.max(jnp.where(free, -distance, 0.0), initial=0.0)
+    return stretch, depth
 
 
 def _host(result, free) -> tuple[float, np.ndarray, float]:

@@ -7,17 +7,20 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 
 from clothjax import character as characters
 from clothjax import clips as motion
 from clothjax import compact_latent, fit, losses, rollout
+from clothjax import devices as spread
+from clothjax.character import Character
 from clothjax.clips import Clips
 from clothjax.config import Config, Range
 from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.fit import Weights
 from clothjax.scene import Scene, laplacian_basis
-from clothjax.types import Array, ClothState, Contact, Material
+from clothjax.types import Array, ClothState, Material
 
 
 class Simulation(NamedTuple):
@@ -58,6 +61,13 @@ def sample_material(key: Array, config: Config) -> Material:
     return Material(*(draw(k, limits) for k, limits in zip(jax.random.split(key, 4), ranges)))
 
 
+def wearer(scene: Scene, betas: Array, material: Material, config: Config) -> Character:
+    """The character of a simulation; where all of them share a shape or a material, these are constants."""
+    fixed = config.stage1.betas == 0
+    cloth = material if config.material.sample else configured_material(config)
+    return characters.dress(scene, None if fixed else betas, cloth, config.physics)
+
+
 def optimizer(config: Config) -> optax.GradientTransformation:
     """Adam behind a clipped norm, at a rate that is constant, then decays; slower for the blend shapes."""
     stage = config.stage1
@@ -96,7 +106,7 @@ def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
     )
     material = sample_material(keys[1], config)
     frame = motion.draw(clips, jax.random.uniform(keys[2]))
-    character = characters.dress(scene, betas, material, config.physics)
+    character = wearer(scene, betas, material, config)
     window = characters.window(scene, character, motion.poses(clips, frame))
     left, channels = compact_latent.latent_size(scene, config.model)
     cloth = rollout.start(character, window, left * channels)
@@ -134,15 +144,14 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
         scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
     )
     rest = character.template
-    away = jnp.zeros_like(rest).at[:, 1].set(-1.0)
     step = losses.TimeStep(
         position=rest,
         velocity=jnp.zeros_like(rest),
         mass=character.mass,
         rest=character.rest,
         material=character.material,
-        contact=Contact(away, away, -away, -away, jnp.zeros(len(rest), jnp.int32)),
-        touching=jnp.zeros(len(rest), bool),
+        contact=None,
+        touching=None,
         timestep=jnp.float32(1.0 / config.fps),
     )
     left, channels = compact_latent.latent_size(scene, config.model)
@@ -164,7 +173,7 @@ def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
 
     def features(key):
         simulation = begin(key, scene, clips, config)
-        character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
+        character = wearer(scene, simulation.betas, simulation.material, config)
         window = characters.window(scene, character, motion.poses(clips, simulation.frame))
         step = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
         return compact_latent.feature.features(
@@ -183,7 +192,7 @@ def rollout_length(step: int, config: Config) -> int:
 
 
 def make_curriculum(
-    scene: Scene, clips: Clips, config: Config, steps: int
+    scene: Scene, clips: Clips, config: Config, steps: int, devices: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """`make_update` with the rollout growing as training proceeds; one compilation for each length."""
     made = {}
@@ -191,31 +200,34 @@ def make_curriculum(
     def update(state: TrainingState):
         frames = rollout_length(int(state.step), config)
         if frames not in made:
-            made[frames] = make_update(scene, clips, config, frames, steps)
+            made[frames] = make_update(scene, clips, config, frames, steps, devices)
         return made[frames](state)
 
     return update
 
 
 def make_update(
-    scene: Scene, clips: Clips, config: Config, frames: int, steps: int
+    scene: Scene, clips: Clips, config: Config, frames: int, steps: int, devices: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """A jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
 
-    It consumes its argument (buffers are donated).
+    It consumes its argument (buffers are donated). The simulations of a batch are spread over the devices.
     """
     stage = config.stage1
     transform = optimizer(config)
 
     def loss_of(params, statistics, simulation, step, clips):
-        character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
+        character = wearer(scene, simulation.betas, simulation.material, config)
         return rollout.training_rollout(
             params, statistics, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
             step, frames, config,
         )  # fmt: skip
 
     def batch_loss(params, statistics, simulations, step, clips):
-        loss, rest = _each(lambda one: loss_of(params, statistics, one, step, clips), simulations)
+        def each(simulations, params, statistics, step, clips):
+            return _each(lambda one: loss_of(params, statistics, one, step, clips), simulations)
+
+        loss, rest = spread.split(each, devices)(simulations, params, statistics, step, clips)
         return jnp.mean(loss), (loss, rest)
 
     def one(clips: Clips, state: TrainingState, _):
@@ -262,18 +274,20 @@ def make_update(
         metrics |= {name: jnp.mean(values) for name, values in terms.items()}
         return new, metrics
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, out_shardings=spread.replicated(devices))
     def update(state, clips):
         return jax.lax.scan(partial(one, clips), state, None, length=steps)
 
-    clips = jax.tree.map(jnp.asarray, clips)
+    clips = spread.copied(clips, devices)
     return lambda state: update(state, clips)
 
 
 def _each(function: Callable, stacked):
-    """`function` of every element of a stack: one alone without vmap, which would slow the searches for contact."""
-    if len(jax.tree.leaves(stacked)[0]) > 1:
+    """`function` of every element of a stack: on a CPU one after the other, since side by side slows searches."""
+    if jax.default_backend() != "cpu":
         return jax.vmap(function)(stacked)
+    if len(jax.tree.leaves(stacked)[0]) > 1:
+        return jax.lax.map(function, stacked)
     return jax.tree.map(lambda x: x[None], function(jax.tree.map(lambda x: x[0], stacked)))
 
 

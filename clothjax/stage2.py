@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 
-from clothjax import character as characters
 from clothjax import clips as motion
+from clothjax import devices as spread
 from clothjax import fit, garment_model, latent_predictor, rollout, stage1
 from clothjax.clips import Clips
 from clothjax.config import Config, ModelConfig
@@ -53,6 +54,7 @@ def teach(
     kept: np.ndarray,
     config: Config,
     progress: Callable = lambda done: None,
+    devices: Mesh | None = None,
 ) -> tuple[Teacher, float]:
     """Rolls Phi out on random clips, bodies and materials; also tells the seconds it took.
 
@@ -60,15 +62,16 @@ def teach(
         model: Phi's `params` and `statistics`.
         kept: joints that are inputs.
         progress: called with the number of sequences done.
+        devices: each rolls out a part of the sequences.
     """
     stage = config.stage2
     fps = config.fps
     began = time.monotonic()
-    clips = jax.tree.map(jnp.asarray, clips)
+    clips = spread.copied(clips, devices)
 
-    def sequence(key: Array):
+    def sequence(key: Array, model: dict, clips: Clips):
         simulation = stage1.begin(key, scene, clips, config)
-        character = characters.dress(scene, simulation.betas, simulation.material, config.physics)
+        character = stage1.wearer(scene, simulation.betas, simulation.material, config)
         frames = simulation.frame + jnp.arange(stage.frames)
         poses = jax.vmap(lambda t: motion.poses(clips, t))(frames)
         _, _states, latents = rollout.play(model, scene, character, poses, config)
@@ -83,18 +86,25 @@ def teach(
         first = jnp.zeros_like(latents[:1])
         return jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants
 
-    run = jax.jit(jax.vmap(sequence))
+    rollouts = spread.split(jax.vmap(sequence, (0, None, None)), devices)
+    run = jax.jit(rollouts, out_shardings=spread.replicated(devices))
     keys = jax.random.split(jax.random.key(stage.seed + 1), stage.sequences)
+    alone = devices is None
     on_cpu = jax.default_backend() == "cpu"
-    size = min(ON_CPU if on_cpu else ELSEWHERE, stage.sequences)
+    among = 1 if alone else devices.size
+    size = among * min(ON_CPU if on_cpu else ELSEWHERE, -(-stage.sequences // among))
+
+    def some(start: int):
+        rows = np.arange(start, start + size) % stage.sequences
+        return jax.device_get(run(spread.copied(keys[rows], devices), model, clips))
+
     parts = []
     # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
-    with ThreadPoolExecutor(os.cpu_count() if on_cpu else 1) as pool:
-        starts = range(0, stage.sequences, size)
-        for part in pool.map(lambda start: jax.device_get(run(keys[start : start + size])), starts):
+    with ThreadPoolExecutor(os.cpu_count() if on_cpu and alone else 1) as pool:
+        for part in pool.map(some, range(0, stage.sequences, size)):
             parts.append(part)
             progress(min(len(parts) * size, stage.sequences))
-    teacher = Teacher(*(np.concatenate(part) for part in zip(*parts)))
+    teacher = Teacher(*(np.concatenate(part)[: stage.sequences] for part in zip(*parts)))
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
         raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")
@@ -186,9 +196,12 @@ def rollout_loss(
 
 
 def make_update(
-    teacher: Teacher, config: Config, steps: int
+    teacher: Teacher, config: Config, steps: int, devices: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """A jitted function that takes `steps` training steps, and their metrics [steps]; it consumes its argument."""
+    """A jitted function that takes `steps` training steps, and their metrics [steps]; it consumes its argument.
+
+    A batch is spread over the devices.
+    """
     stage = config.stage2
     transform = optimizer(config)
     sequences, frames = teacher.poses.shape[:2]
@@ -198,13 +211,15 @@ def make_update(
         which = jax.random.randint(keys[0], (stage.batch,), 0, sequences)
         begin = jax.random.randint(keys[1], (stage.batch,), 0, frames - stage.rollout + 1)
 
-        def one(sequence, begin, key):
+        def one(part, params, state, teacher):
+            sequence, begin, key = part
             latents = jax.lax.dynamic_slice_in_dim(teacher.latents[sequence], begin, stage.rollout + 1)
             poses = jax.lax.dynamic_slice_in_dim(teacher.poses[sequence], begin, stage.rollout)
             constants = teacher.constants[sequence]
             return rollout_loss(params, state, latents, poses, constants, key, config)
 
-        return jnp.mean(jax.vmap(one)(which, begin, jax.random.split(keys[2], stage.batch)))
+        each = spread.split(jax.vmap(one, (0, None, None, None)), devices)
+        return jnp.mean(each((which, begin, jax.random.split(keys[2], stage.batch)), params, state, teacher))
 
     def one(teacher: Teacher, state: TrainingState, _):
         key = jax.random.fold_in(state.key, state.step)
@@ -214,9 +229,9 @@ def make_update(
         )
         return state._replace(step=state.step + 1, **weights._asdict()), metrics
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, out_shardings=spread.replicated(devices))
     def update(state, teacher):
         return jax.lax.scan(partial(one, teacher), state, None, length=steps)
 
-    teacher = jax.tree.map(jnp.asarray, teacher)
+    teacher = spread.copied(teacher, devices)
     return lambda state: update(state, teacher)

@@ -71,7 +71,6 @@ class Rest(NamedTuple):
     face_area: Array  # [F] m^2
     hinge_area: Array  # [H] m^2, of the two faces together
     hinge_angle: Array  # [H] rad
-    vertex_area: Array  # [V] m^2, a third of the incident faces
 
 
 class Contact(NamedTuple):

@@ -62,20 +62,20 @@ class Reference:
 
     def time_step(self) -> TimeStep:
         """The next step, without friction; the contact plane of a vertex touches the sphere nearest to it."""
-        normal = np.tile([0.0, 1.0, 0.0], (len(self.position), 1))
-        point = self.position - normal  # nothing to touch
+        contact = None
         if self.scene.centre is not None:
             normal = self.position - self.scene.centre
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             point = self.scene.centre + SPHERE * normal
+            contact = Contact(point, point, normal, normal, np.zeros(len(point), np.int32))
         return TimeStep(
             position=self.position,
             velocity=self.velocity,
-            mass=self.rest.vertex_area * MATERIAL.density,
+            mass=masses(self.scene),
             rest=self.rest,
             material=MATERIAL,
-            contact=Contact(point, point, normal, normal, np.zeros(len(point), np.int32)),
-            touching=np.zeros(len(point), bool),
+            contact=contact,
+            touching=None,
             timestep=self.timestep,
         )
 
@@ -94,7 +94,7 @@ class Vbd:
     def __init__(self, scene: Scene, timestep: float, iterations: int):
         newton, warp = _newton()
         rest, (a, b, left, right) = at_rest(scene), scene.mesh.hinges.T
-        mass = rest.vertex_area * MATERIAL.density
+        mass = masses(scene)
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -physics.GRAVITY, 0.0))
         # triangles and hinges take their rest shape from the positions of now
         builder.add_particles(
@@ -179,6 +179,12 @@ def at_rest(scene: Scene) -> Rest:
     """Rest measures of the sheet, in float64."""
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, physics.rest_measures(scene.flat, scene.mesh))
+
+
+def masses(scene: Scene) -> np.ndarray:
+    """[V] kg, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(physics.vertex_areas(scene.flat, scene.mesh.faces)) * MATERIAL.density
 
 
 def _newton():

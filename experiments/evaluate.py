@@ -113,9 +113,10 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
         measured = metrics.gaps(
             metrics.step_measures(whole.scene, character, jnp.asarray(track), poses, sampled, config)
         )
-        measured |= metrics.penetrations(
-            whole.scene, whole.body, jnp.asarray(betas), track, poses, range(SETTLING, frames, 4)
-        )
+        if whole.scene.touchable:
+            measured |= metrics.penetrations(
+                whole.scene, whole.body, jnp.asarray(betas), track, poses, range(SETTLING, frames, 4)
+            )
         measured |= metrics.edge_strain(whole.scene, character, track[SETTLING:])
         measured["jitter"] = metrics.roughness(track[SETTLING:count], advance[SETTLING : count - 1]) / rough
         result[stage] = measured

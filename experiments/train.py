@@ -2,14 +2,22 @@
 
     python -m experiments.train configs/quickstart.yaml
     python -m experiments.train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
+    python -m experiments.train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
 
 It leaves `stage1/` and `stage2/` in the run's folder, each with checkpoints, metrics.jsonl and training.json.
+
+With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
+Open MPI or Kubernetes job train together; elsewhere each is told `--processes ADDRESS:PORT,COUNT,INDEX`.
 """
 
+import argparse
 import sys
 from pathlib import Path
 
-from clothjax import checkpoint, configuration, experiment, fit, latent_predictor, stage1, stage2
+import jax
+from jax.sharding import Mesh
+
+from clothjax import checkpoint, configuration, devices, experiment, fit, latent_predictor, stage1, stage2
 from clothjax.config import Config
 from clothjax.features import Statistics
 from experiments.session import fail_clearly, progress, setup
@@ -18,8 +26,17 @@ STEPS_PER_CALL = 20
 
 
 def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--devices", default=None)
+    parser.add_argument("--processes", default="")
+    where, argv = parser.parse_known_args(argv)
     config = configuration.cli(Config, argv)
-    train(config, run_directory(config, argv))
+    devices.connect(where.processes)
+    several = jax.process_count() > 1
+    chosen = devices.choose(where.devices or ("auto" if several else "1"), config.stage1.batch, config.stage2.batch)
+    directory = run_directory(config, argv)
+    with devices.together(directory):
+        train(config, directory, chosen)
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
@@ -27,8 +44,10 @@ def run_directory(config: Config, argv: list[str]) -> Path:
     return Path(config.directory or Path("runs") / Path(argv[0]).stem)
 
 
-def train(config: Config, directory: Path) -> dict[str, float]:
+def train(config: Config, directory: Path, among: Mesh | None = None) -> dict[str, float]:
     """Both stages; returns the seconds each took, with `compile_seconds` and `teacher_seconds` apart."""
+    if among is not None:
+        print(f"{among.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     whole = experiment.assemble(config)
     reel, bad = experiment.training_clips(whole)
     for name, count in bad.items():
@@ -38,8 +57,8 @@ def train(config: Config, directory: Path) -> dict[str, float]:
 
     print(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     first = fit.fit(
-        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL),
-        stage1.init(whole.scene, reel, config),
+        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, among),
+        devices.copied(stage1.init(whole.scene, reel, config), among),
         steps=config.stage1.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage1",
@@ -52,10 +71,10 @@ def train(config: Config, directory: Path) -> dict[str, float]:
 
     print(f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi")
     with progress("rolling out the teacher", config.stage2.sequences) as report:
-        teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report)
+        teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, among)
     second = fit.fit(
-        stage2.make_update(teacher, config, STEPS_PER_CALL),
-        stage2.init(teacher, first.state.average["garment"], config),
+        stage2.make_update(teacher, config, STEPS_PER_CALL, among),
+        devices.copied(stage2.init(teacher, jax.device_get(first.state.average["garment"]), config), among),
         steps=config.stage2.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage2",

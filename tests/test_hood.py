@@ -185,14 +185,17 @@ def test_every_block_is_hoods(golden, shared):
     pair_latents = {"to_body": world("roll2_enc_c2o"), "to_garment": world("roll2_enc_o2c")}
     done = 0
     for stack, stacked, least in zip(hood.SCHEDULE, params["processor"], (0, 1, 2, 1, 0)):
-        mask = jnp.asarray(active & (garment.level >= least))
+        rows, graph = graph_network._reached(stack, garment.graph, garment.level)
+        np.testing.assert_array_equal(np.arange(count)[rows], np.flatnonzero(garment.level >= least))
         for index in range(stack.blocks):
             p = jax.tree.map(lambda x, index=index: x[index], stacked)
-            nodes, body, updated, pair_latents = graph_network._block(
-                p, nodes, body, {name: edges[name] for name in stack.edges}, pair_latents, garment.graph,
-                jnp.asarray(slots), mask, True,
+            nodes, body, updated, near = graph_network._block(
+                p, nodes, body, {name: edges[name] for name in stack.edges},
+                {name: latents[rows] for name, latents in pair_latents.items()},
+                rows, graph, jnp.asarray(slots[rows]), jnp.asarray(active[rows]),
             )  # fmt: skip
             edges |= updated
+            pair_latents = {name: pair_latents[name].at[rows].set(latents) for name, latents in near.items()}
             np.testing.assert_allclose(nodes, full[f"roll2_step{done:02d}_cloth"], rtol=0, atol=1e-10)
             touched = np.unique(pairs[1])
             np.testing.assert_allclose(body[touched], full[f"roll2_step{done:02d}_obst"][touched], rtol=0, atol=1e-10)

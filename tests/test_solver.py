@@ -39,13 +39,14 @@ def time_step(
     """A step over level ground at height `ground` m, in float64."""
     with jax.enable_x64(True):
         rest = jax.tree.map(np.asarray, physics.rest_measures(vertices, mesh))
+        areas = np.asarray(physics.vertex_areas(vertices, mesh.faces))
     position = vertices if position is None else position
     up, under = np.zeros_like(position), position.copy()
     up[:, 1], under[:, 1] = 1.0, ground
     return TimeStep(
         position=position,
         velocity=np.zeros_like(position) if velocity is None else velocity,
-        mass=rest.vertex_area * MATERIAL.density,
+        mass=areas * MATERIAL.density,
         rest=rest,
         material=MATERIAL,
         contact=Contact(under, under, up, up, np.zeros(len(position), np.int32)),

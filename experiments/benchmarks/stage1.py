@@ -1,6 +1,9 @@
 """What a training step of Phi costs, part by part."""
 
 import dataclasses
+import tempfile
+import time
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,25 +11,50 @@ import numpy as np
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, experiment, graph_sampling, mesh_convolution, rollout, solver
+from clothjax import compact_latent, experiment, fit, graph_sampling, losses, mesh_convolution, rollout, solver
+from clothjax import features as feature
 from clothjax import stage1 as training
+from clothjax.character import Character, Window
+from clothjax.clips import Clips
 from clothjax.config import Config
-from experiments.benchmarks import textbook
-from experiments.benchmarks.timing import cost, interleaved, program, temporary_bytes
+from clothjax.experiment import Experiment
+from clothjax.features import Features
+from clothjax.losses import TimeStep
+from clothjax.types import ClothState
+from experiments.benchmarks import textbook, timing
+from experiments.benchmarks.timing import against_peaks, cost, interleaved, program, temporary_bytes
 
 CONVOLUTION = (32, 64)  # channels at which the kernel of every vertex and neighbour fits into memory
+COMPILED_FRAMES = 3  # of the rollout whose compilation is timed
+BATCH = 4
+
+
+class Moment(NamedTuple):
+    """The first frame of a simulation, and all that a step of Phi there starts from."""
+
+    state: training.TrainingState
+    clips: Clips
+    character: Character
+    cloth: ClothState
+    window: Window
+    step: TimeStep
+    seen: Features
 
 
 def measure(config: Config, rounds: int) -> dict:
-    """All figures of stage 1 at a configuration whose body nodes take part in message passing."""
+    """All figures of a training step at a configuration whose body nodes take part in message passing."""
     whole = experiment.assemble(config)
+    moment = first_moment(whole)
     report = {"vertices": len(whole.garment.vertices), "width": config.model.width}
-    return report | processor(whole, config, rounds) | convolution(whole, config, rounds)
+    report |= processor(whole, moment, rounds)
+    report |= convolution(whole, rounds)
+    report |= compilation(whole)
+    return report | step(whole, moment, rounds)
 
 
-def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict:
+def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
     """Encoder and processor, forward and backward, against the textbook's."""
-    state, seen = example(whole, config)
+    config, state = whole.config, moment.state
 
     def loss(form, model):
         def total(params, statistics, seen):
@@ -37,7 +65,7 @@ def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict
     names = ("type_embedding", "level_embedding", "encoder", "processor")
     params = {name: state.params[name] for name in names}
     forms = {"ours": compact_latent.pass_messages, "textbook": textbook.process}
-    arguments = (params, state.statistics, seen)
+    arguments = (params, state.statistics, moment.seen)
     kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
     programs = {
         "ours": program(loss(forms["ours"], recomputed), *arguments),
@@ -67,8 +95,9 @@ def processor(whole: experiment.Experiment, config: Config, rounds: int) -> dict
     }
 
 
-def convolution(whole: experiment.Experiment, config: Config, rounds: int) -> dict:
+def convolution(whole: Experiment, rounds: int) -> dict:
     """The first block of the mesh convolution, forward and backward, against building every kernel."""
+    config = whole.config
     level = config.model.convolution[0]
     count = len(whole.garment.vertices)
     table = graph_sampling.hierarchy(whole.garment.faces, count, [level.stride], [level.radius])[0]
@@ -99,21 +128,142 @@ def convolution(whole: experiment.Experiment, config: Config, rounds: int) -> di
     }
 
 
-def example(whole: experiment.Experiment, config: Config):
-    """A training state, and the inputs of Phi at the first frame of a simulation."""
+def compilation(whole: Experiment) -> dict:
+    """Seconds until a training step on a rollout is traced and compiled: without, and with, a persistent cache."""
+    config = whole.config
     reel, _ = experiment.training_clips(whole)
-    state = training.init(whole.scene, reel, config)
-    clips = jax.tree.map(jnp.asarray, reel)
+    state = jax.eval_shape(lambda: training.init(whole.scene, reel, config))
 
-    def features(key):
-        simulation = training.begin(key, whole.scene, clips, config)
-        character = characters.dress(whole.scene, simulation.betas, simulation.material, config.physics)
-        window = characters.window(whole.scene, character, motion.poses(clips, simulation.frame))
-        step = rollout.time_step(whole.scene, character, simulation.cloth, window, 1.0 / config.fps, config)
+    def once() -> float:
+        jax.clear_caches()
+        began = time.perf_counter()
+        jax.jit(training.make_update(whole.scene, reel, config, COMPILED_FRAMES, 1)).lower(state).compile()
+        return time.perf_counter() - began
+
+    before = jax.config.jax_compilation_cache_dir
+    with tempfile.TemporaryDirectory() as folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        jax.experimental.compilation_cache.compilation_cache.reset_cache()
+        try:
+            return {"compile_seconds_cold": once(), "compile_seconds_cached": once()}
+        finally:
+            jax.config.update("jax_compilation_cache_dir", before)
+            jax.experimental.compilation_cache.compilation_cache.reset_cache()
+
+
+def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
+    """The training step and its pieces, beside the peaks of this machine; and a batch against single steps."""
+    config, scene = whole.config, whole.scene
+    several = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, batch=BATCH, pool=BATCH))
+    states = {"step": moment.state, "batch": training.init(scene, moment.clips, several)}
+    updates = {
+        name: training.make_update(scene, moment.clips, one, 1, 1)
+        for name, one in {"step": config, "batch": several}.items()
+    }
+    pieces = _pieces(whole, moment)
+    programs = {name: program(*piece) for name, piece in pieces.items()}
+    programs |= {name: program(update, states[name]) for name, update in updates.items()}
+    seconds = interleaved(programs, rounds)
+    best = timing.peaks(rounds)
+    # a loop would be counted once: without loops, and so without anything recomputed in them
+    plain = dataclasses.replace(config, model=dataclasses.replace(config.model, remat=False))
+    with timing.unrolled():
+        counted = {name: cost(program(*piece)) for name, piece in _pieces(whole._replace(config=plain), moment).items()}
+    return {
+        "step_seconds": seconds["step"],
+        "step_temporary_mib": temporary_bytes(programs["step"]) / 2**20,
+        "contact_share": seconds["contact"] / seconds["step"],
+        "batch4_per_window_ratio": seconds["batch"] / BATCH / seconds["step"],
+        "peaks": best,
+        "pieces": {
+            name: {
+                **against_peaks(seconds[name], counted[name], best),
+                "share": seconds[name] / seconds["step"],
+                "temporary_mib": temporary_bytes(programs[name]) / 2**20,
+            }
+            for name in pieces
+        },
+    }
+
+
+def _pieces(whole: Experiment, moment: Moment) -> dict:
+    """Functions, with their arguments, that together are most of a training step."""
+    config, scene = whole.config, whole.scene
+    params, statistics = moment.state.params, moment.state.statistics
+    character, cloth, window, seen = moment.character, moment.cloth, moment.window, moment.seen
+
+    def contact(cloth, window, character):
+        step = rollout.time_step(scene, character, cloth, window, 1.0 / config.fps, config)
+        held = cloth.position
+        found = feature.features(
+            scene,
+            character,
+            cloth,
+            window,
+            step.contact,
+            step.timestep,
+            held,
+            0.0 * held,
+            config.model,
+            config.material,
+        )
+        return step, found.world
+
+    def bodies(poses, character):
+        return characters.window(scene, character, poses)
+
+    def passing(params, seen):
+        return jnp.mean(compact_latent.pass_messages(params, statistics, scene, seen, config.model) ** 2)
+
+    def convolving(params, processed):
+        return jnp.mean(compact_latent.convolve(params, scene, processed, config.model) ** 2)
+
+    def physics(params, latent, step):
+        new = compact_latent.decode(params, scene, character, latent, window, config.model)
+        return losses.potential(new, step, scene.mesh, config.physics)
+
+    def descent(gradient, weights):
+        return fit.descend(training.optimizer(config), weights, jnp.float32(0.0), gradient, config.stage1.ema)
+
+    def gradient(function, *names):
+        chosen = {name: params[name] for name in params if name in names}
+        return jax.value_and_grad(function), chosen
+
+    processed = jnp.zeros((len(cloth.position), config.model.width))
+    weights = fit.Weights(moment.state.params, moment.state.average, moment.state.optimizer)
+    poses = motion.poses(moment.clips, moment.state.pool.frame[0])
+    return {
+        "skinning the body": (bodies, poses, character),
+        "contact": (contact, cloth, window, character),
+        "encoder and processor": (
+            *gradient(passing, "type_embedding", "level_embedding", "encoder", "processor"),
+            seen,
+        ),
+        "mesh convolution": (*gradient(convolving, "convolution", "latent"), processed),
+        "decoder and physics": (*gradient(physics, "garment"), cloth.latent, moment.step),
+        "optimiser": (descent, params, weights),
+    }
+
+
+def first_moment(whole: Experiment) -> Moment:
+    """The first frame of the first simulation of a training."""
+    config, scene = whole.config, whole.scene
+    reel, _ = experiment.training_clips(whole)
+    clips = jax.tree.map(jnp.asarray, reel)
+    state = training.init(scene, clips, config)
+    simulation = jax.tree.map(lambda x: x[0], state.pool)
+
+    @jax.jit
+    def start(simulation):
+        character = training.wearer(scene, simulation.betas, simulation.material, config)
+        window = characters.window(scene, character, motion.poses(clips, simulation.frame))
+        step = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
         held = simulation.cloth.position
-        return compact_latent.feature.features(
-            whole.scene, character, simulation.cloth, window, step.contact, step.timestep, held, jnp.zeros_like(held),
+        seen = feature.features(
+            scene, character, simulation.cloth, window, step.contact, step.timestep, held, 0.0 * held,
             config.model, config.material,
         )  # fmt: skip
+        return character, window, step, seen
 
-    return state, jax.jit(features)(jax.random.key(0))
+    character, window, step, seen = start(simulation)
+    return Moment(state, clips, character, simulation.cloth, window, step, seen)

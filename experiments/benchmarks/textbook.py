@@ -25,17 +25,18 @@ def process(params, statistics, scene, seen, config) -> Array:
         return mlp(encoder["nodes"], jnp.concatenate([feature.normalise(statistics["nodes"], rows), embedded], axis=-1))
 
     garment = nodes(seen.nodes, 3 * pinned, jnp.asarray(scene.level))
-    body = nodes(seen.body, jnp.ones_like(pinned), jnp.zeros_like(pinned))
+    ones = jnp.ones(len(seen.world.nodes), jnp.int32)
+    body = nodes(seen.world.nodes, ones, 0 * ones)
     every = jnp.concatenate([garment, body])
     graph = {name: (jnp.asarray(e.senders), jnp.asarray(e.receivers)) for name, e in scene.graph.items()}
     edges = {name: mlp(encoder[name], feature.normalise(statistics["mesh"], seen.edges[name])) for name in seen.edges}
-    vertex = jnp.arange(count, dtype=seen.slots.dtype)
-    slot = count + seen.slots
+    vertex = jnp.arange(count, dtype=seen.world.slots.dtype)
+    slot = count + seen.world.slots
     graph["world"] = (jnp.concatenate([slot, vertex]), jnp.concatenate([vertex, slot]))
-    pairs = jnp.concatenate([seen.to_garment, seen.to_body])
+    pairs = jnp.concatenate([seen.world.to_garment, seen.world.to_body])
     edges["world"] = mlp(encoder["world"], feature.normalise(statistics["world"], pairs))
     for stack, stacked in zip(config.processor, params["processor"]):
-        active = seen.active & jnp.asarray(scene.level >= stack.lowest_level)
+        active = seen.world.active & jnp.asarray(scene.level >= stack.lowest_level)
         keep = jnp.concatenate([active, active])[:, None]
         for index in range(stack.blocks):
             block = jax.tree.map(lambda x, i=index: x[i], stacked)
@@ -46,7 +47,7 @@ def process(params, statistics, scene, seen, config) -> Array:
                 message = mlp(block[f"edge_{name}"], rows)
                 if name == "world":
                     message = jnp.where(keep, message, 0.0)
-                arrived.append(jax.ops.segment_sum(message, receivers, 2 * count))
+                arrived.append(jax.ops.segment_sum(message, receivers, len(every)))
                 latents[name] = edges[name] + message
             every = every + mlp(block["node"], jnp.concatenate([every, *arrived], axis=-1))
             edges = edges | latents

@@ -1,10 +1,18 @@
-"""Time, floating-point operations and memory of compiled programs."""
+"""Time, floating-point operations and memory of compiled programs, and what this machine could do at best."""
 
+import contextlib
 import time
+from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
+from unittest import mock
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+MATRIX = 2048  # rows, for the peak of products
+STREAM = 64 * 2**20  # numbers, for the peak of the memory: no cache holds them
 
 
 class Program(NamedTuple):
@@ -41,6 +49,32 @@ def temporary_bytes(one: Program) -> int:
 
 
 def cost(one: Program) -> dict[str, float]:
-    """The compiler's count of floating-point operations and bytes accessed."""
+    """The compiler's count of floating-point operations and bytes accessed; the inside of a loop counts once."""
     counted = one.compiled.cost_analysis() or {}
     return {"flops": float(counted.get("flops", 0.0)), "bytes": float(counted.get("bytes accessed", 0.0))}
+
+
+@contextlib.contextmanager
+def unrolled() -> Iterator[None]:
+    """Within it, scans are compiled without loops, so that `cost` counts all of them."""
+    with mock.patch.object(jax.lax, "scan", partial(jax.lax.scan, unroll=True)):
+        yield
+
+
+def peaks(rounds: int) -> dict[str, float]:
+    """What this machine reaches: flop/s in a product of float32 matrices, byte/s in a sum of long vectors."""
+    square, long = jnp.ones((MATRIX, MATRIX)), jnp.ones(STREAM)
+    seconds = interleaved(
+        {"matrix": program(lambda a: a @ a, square), "stream": program(lambda a: a + 1.0, long)}, rounds
+    )
+    return {"flops_per_second": 2 * MATRIX**3 / seconds["matrix"], "bytes_per_second": 8 * STREAM / seconds["stream"]}
+
+
+def against_peaks(seconds: float, counted: dict[str, float], best: dict[str, float]) -> dict[str, float]:
+    """A program's cost with the fractions of both peaks that it reaches."""
+    return {
+        "seconds": seconds,
+        **counted,
+        "matrix_peak_fraction": counted["flops"] / seconds / best["flops_per_second"],
+        "bandwidth_fraction": counted["bytes"] / seconds / best["bytes_per_second"],
+    }

@@ -1,0 +1,173 @@
+"""Several devices train as one does; several processes train together, stop together and go on together."""
+
+import dataclasses
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from toy import small
+
+from clothjax import checkpoint, configuration, devices
+from clothjax.config import Config
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_how_processes_are_named(monkeypatch):
+    joined = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *where: joined.append(where))
+    for name in ("SLURM_NTASKS", "SLURM_PROCID", "OMPI_COMM_WORLD_SIZE", "KUBERNETES_SERVICE_HOST"):
+        monkeypatch.delenv(name, raising=False)
+    devices.connect()
+    assert joined == []  # one process alone
+    devices.connect("node1:4000,3,2")
+    assert joined.pop() == ("node1:4000", 3, 2)
+    for wrong in ("node1:4000", "node1,2,0", "node1:4000,two,0"):
+        with pytest.raises(ValueError, match="processes are ADDRESS:PORT,COUNT,INDEX"):
+            devices.connect(wrong)
+    with pytest.raises(ValueError, match="process 2 of 2: indices count from 0"):
+        devices.connect("node1:4000,2,2")
+
+
+@pytest.mark.parametrize(
+    "cluster, several",
+    [
+        ({"SLURM_NTASKS": "2", "SLURM_PROCID": "0"}, True),
+        ({"SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, False),
+        ({"OMPI_COMM_WORLD_SIZE": "4", "OMPI_COMM_WORLD_RANK": "3"}, True),
+        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1", "JOB_COMPLETION_INDEX": "1"}, True),
+        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, False),
+    ],
+)
+def test_a_cluster_is_noticed(monkeypatch, cluster, several):
+    joined = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *where: joined.append(where))
+    for name in ("SLURM_NTASKS", "SLURM_PROCID", "OMPI_COMM_WORLD_SIZE", "KUBERNETES_SERVICE_HOST"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in cluster.items():
+        monkeypatch.setenv(name, value)
+    devices.connect()
+    assert joined == ([()] if several else [])
+
+
+def test_which_devices_are_chosen(monkeypatch):
+    one = jax.devices()[0]
+    monkeypatch.setattr(devices.jax, "devices", lambda: [one] * 8)
+    monkeypatch.setattr(devices, "Mesh", lambda chosen, names: chosen)
+    assert devices.choose("auto", 1, 32) is None
+    assert len(devices.choose("auto", 4, 32)) == 4
+    assert len(devices.choose("auto", 12, 32)) == 4
+    assert len(devices.choose("8", 16, 32)) == 8
+    for wanted, words in (("3", "cannot be divided among 3 devices"), ("9", "9 devices are wanted, there are 8"),
+                          ("all", "a number or `auto`, not 'all'"), ("0", "a number or `auto`")):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            devices.choose(wanted, 4, 32)
+    monkeypatch.setattr(devices.jax, "process_count", lambda: 2)
+    with pytest.raises(ValueError, match="2 processes have 8 devices and use all of them, not 4"):
+        devices.choose("4", 8, 32)
+    with pytest.raises(ValueError, match="cannot be divided among 8 devices"):
+        devices.choose("auto", 4, 32)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    """A small experiment with four simulations an update, as a file."""
+    config = dataclasses.replace(small(), motions=("walk_0",))
+    config = dataclasses.replace(
+        config,
+        stage1=dataclasses.replace(config.stage1, steps=20, pool=8, batch=4, restart_probability=0.5),
+        stage2=dataclasses.replace(config.stage2, steps=20, batch=4, sequences=3),
+    )
+    path = tmp_path_factory.mktemp("several") / "small.yaml"
+    path.write_text(yaml.safe_dump(json.loads(json.dumps(configuration.to_dict(config)))))
+    return path
+
+
+def start(config, directory, *arguments, count=1):
+    """A training with `count` devices of its own, as a user starts it."""
+    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={count}"}
+    command = [sys.executable, "-m", "experiments.train", str(config), "--directory", str(directory), *arguments]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=environment
+    )
+
+
+def finish(*processes, seconds=400):
+    outputs = [process.communicate(timeout=seconds)[0] for process in processes]
+    for process, output in zip(processes, outputs):
+        assert process.returncode == 0, output
+    return outputs
+
+
+def trained(directory):
+    """What a training left: the parameters of Phi and of Psi."""
+    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in ("stage1", "stage2")]
+
+
+def assert_close(one, other):
+    """Equal to 1e-6 of the largest parameter of each kind."""
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * max(1.0, float(np.abs(a).max())))
+
+
+@pytest.fixture(scope="module")
+def alone(config):
+    finish(start(config, config.parent / "alone"))
+    return trained(config.parent / "alone")
+
+
+def test_four_devices_train_as_one(config, alone):
+    (output,) = finish(start(config, config.parent / "four", "--devices", "auto", count=4))
+    assert "4 devices, 1 processes" in output
+    assert_close(alone, trained(config.parent / "four"))
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def pair(config, directory, *arguments):
+    address = f"127.0.0.1:{free_port()}"
+    return [start(config, directory, "--processes", f"{address},2,{index}", *arguments) for index in range(2)]
+
+
+def test_two_processes_train_and_save_together(config, alone):
+    first, second = finish(*pair(config, config.parent / "two"))
+    assert "2 devices, 2 processes" in first and "step 20/20" in first
+    assert "step 20/20" not in second  # one of them reports
+    assert_close(alone, trained(config.parent / "two"))
+
+
+@pytest.mark.parametrize("killed", [0, 1])
+def test_one_killed_stops_the_other_which_says_how_to_go_on(config, killed):
+    directory = config.parent / f"killed_{killed}"
+    processes = pair(config, directory, "--stage1.steps", "100000")
+    checkpoints = directory / "stage1" / "checkpoints"
+    for _ in range(1200):
+        if checkpoint.steps(checkpoints) or any(process.poll() is not None for process in processes):
+            break
+        time.sleep(0.1)
+    processes[killed].send_signal(signal.SIGKILL)
+    processes[killed].communicate()
+    output, _ = processes[1 - killed].communicate(timeout=120)
+    assert processes[1 - killed].returncode not in (0, None), output
+    assert "another process of this training is gone" in output and "start all of them again" in output, output
+    assert checkpoint.steps(checkpoints), output
+    step = checkpoint.latest(checkpoints).step
+    assert 0 < step < 100000
+
+
+def test_the_default_is_one_device_and_one_process():
+    assert Config().stage1.batch == 1
+    assert devices.choose("1", Config().stage1.batch, Config().stage2.batch) is None

@@ -1,0 +1,229 @@
+"""What a scene lacks is neither computed nor felt; garments of any size and number of pieces make a scene."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import small
+
+from clothjax import character as characters
+from clothjax import clips, experiment, losses, rollout, scene, simulation, stage1, storage
+from clothjax.config import Config, Ramp
+from clothjax.types import Garment, Motion
+from data_prep import garment as garments
+from experiments.benchmarks import scenes
+from experiments.benchmarks.timing import cost, program
+
+
+@pytest.fixture(scope="module")
+def whole():
+    config = dataclasses.replace(small(), motions=("walk_0",))
+    return experiment.assemble(dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1)))
+
+
+@pytest.fixture(scope="module")
+def flops(whole):
+    """Of a frame of a training rollout in every scene, with its losses."""
+    reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
+    counted = {}
+    for name in scenes.SCENES:
+        built = scenes.build(whole, name)
+        state = jax.eval_shape(lambda built=built: stage1.init(built.scene, reel, built.config))
+
+        def loss(params, statistics, pool, clips, built=built):
+            one = jax.tree.map(lambda x: x[0], pool)
+            character = stage1.wearer(built.scene, one.betas, one.material, built.config)
+            return rollout.training_rollout(
+                params, statistics, built.scene, character, one.cloth, clips, one.frame, one.fresh,
+                jnp.int32(0), 1, built.config,
+            )[0]  # fmt: skip
+
+        counted[name] = cost(program(loss, state.params, state.statistics, state.pool, reel))["flops"]
+    return counted
+
+
+def test_every_scene_costs_less_than_the_full_one(flops):
+    assert set(flops) >= {"flag_on_a_pole", "cloth_on_a_table", "pinned_skirt", "no_friction", "no_bending"}
+    full = flops.pop("full")
+    assert all(count < full for count in flops.values()), flops
+    # what is left out is the search for contact, not only a term or two
+    assert flops["flag_on_a_pole"] < 0.7 * full
+    assert flops["flag_on_a_pole"] < flops["no_edge_contact"] < flops["no_friction"]
+    assert flops["cloth_on_a_table"] < flops["no_friction"]
+    # Phi still sees a term that has no weight in the loss
+    assert flops["no_bending"] < flops["bending_weight_zero"]
+
+
+def _step(whole, pose):
+    config, built = whole.config, whole.scene
+    character = characters.dress(built, jnp.zeros(10), experiment.material(config), config.physics)
+    window = characters.window(built, character, pose)
+    state = rollout.start(character, window, 0)
+    step = jax.jit(lambda: rollout.time_step(built, character, state, window, 1.0 / config.fps, config))()
+    return step, character
+
+
+@pytest.fixture(scope="module")
+def pose(whole):
+    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "walk_0")))
+    return clips.poses(reel, jnp.int32(20))
+
+
+@pytest.mark.parametrize(
+    "name, missing",
+    [
+        ("full", set()),
+        ("flag_on_a_pole", {"friction", "collision", "edge_collision"}),
+        ("no_friction", {"friction"}),
+        ("no_bending", {"bending"}),
+        ("no_edge_contact", {"edge_collision"}),
+    ],
+)
+def test_the_energies_of_a_scene(whole, pose, name, missing):
+    changed = scenes.build(whole, name)
+    step, _ = _step(changed, pose)
+    found = losses.energies(step.position, step, changed.scene.mesh, changed.config.physics)
+    assert set(found) == {
+        "stretching", "bending", "gravity", "inertia", "friction", "collision", "edge_collision"
+    } - missing  # fmt: skip
+
+
+def test_a_term_without_weight_is_not_in_the_loss():
+    terms = {"stretching": jnp.float32(1.0), "bending": jnp.float32(2.0)}
+    config = dataclasses.replace(Config().loss, bending=Ramp(0.0), scale=1.0)
+    assert losses.present(terms, config) == {"stretching": terms["stretching"]}
+    assert losses.weighted(losses.present(terms, config), config, jnp.int32(0)) == 1.0
+    ramp = dataclasses.replace(config, bending=Ramp(0.0, 1.0, 0, 10))
+    assert set(losses.present(terms, ramp)) == set(terms)
+
+
+def test_elements_among_pinned_vertices_are_left_out_and_not_missed(whole, pose):
+    pinned = scenes.build(whole, "pinned_skirt")
+    held = np.asarray(pinned.garment.pinned)
+    every, some = whole.scene.mesh, pinned.scene.mesh
+    assert all(len(b) < len(a) for a, b in zip(every, some))
+    assert all(not held[elements].all(axis=1).any() for elements in some)
+    step, character = _step(pinned, pose)
+    np.testing.assert_allclose(character.mass, _step(whole, pose)[1].mass, rtol=1e-6)
+    new = step.position + 1e-3 * np.random.default_rng(0).standard_normal(step.position.shape).astype(np.float32)
+
+    def force(step, mesh):
+        return np.asarray(jax.grad(lambda x: losses.potential(x, step, mesh, whole.config.physics))(new))
+
+    free = force(_step(whole, pose)[0], every)[~held]
+    np.testing.assert_allclose(force(step, some)[~held], free, atol=1e-5 * np.abs(free).max())
+
+
+def test_a_flag_falls_from_its_pole(whole):
+    """Without a body: the held edge stays where skinning puts it, the rest falls past where the body would be."""
+    flag = scenes.build(whole, "flag_on_a_pole")
+    config = flag.config
+    still = storage.load_motion("walk_3", whole.names)
+    still = Motion(np.repeat(still.rotations[:1], 14, 0), np.repeat(still.translation[:1], 14, 0), still.fps)
+    reel = jax.tree.map(jnp.asarray, experiment.windows(still))
+    poses = jax.vmap(lambda t: clips.poses(reel, t))(jnp.arange(1, 13))
+    character = characters.dress(flag.scene, jnp.zeros(10), experiment.material(config), config.physics)
+    quick = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, start_timestep=0.0))
+    track, infos = simulation.simulate(flag.scene, character, poses, quick)
+    assert all(info.converged for info in infos) and np.isfinite(track).all()
+    held = np.asarray(flag.garment.pinned)
+    np.testing.assert_allclose(track[-1, held], track[0, held], atol=1e-6)
+    dropped = (track[0] - track[-1])[~held, 1]
+    assert 0.3 < dropped.max() < 0.5 * 9.81 * (12 / 30) ** 2 + 0.05
+
+
+def test_a_still_body_refuses_a_motion(whole):
+    table = scenes.build(whole, "cloth_on_a_table")
+    with pytest.raises(ValueError, match=r"walk_0 moves, but physics\.body is `still`"):
+        experiment.motion(table, "walk_0")
+
+
+def test_one_shape_for_all_is_the_shape_it_was_modelled_in(whole):
+    config = whole.config
+    fixed = dataclasses.replace(
+        config,
+        stage1=dataclasses.replace(config.stage1, betas=0.0),
+        material=dataclasses.replace(config.material, sample=False),
+    )
+    drawn = stage1.sample_material(jax.random.key(3), config)
+
+    def total(config, betas):
+        character = stage1.wearer(whole.scene, betas, drawn, config)
+        return [jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(character._replace(betas=betas))]
+
+    one = jax.jit(lambda: total(fixed, jnp.zeros(10)))()
+    configured = characters.dress(whole.scene, jnp.zeros(10), experiment.material(config), config.physics)
+    other = [jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(configured)]
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+
+
+def _of(whole, garment):
+    """The same experiment with another garment."""
+    return whole._replace(garment=garment, scene=scene.build(garment, whole.body, whole.config))
+
+
+def _takes_a_step(whole):
+    state, metrics = program(*scenes.update(whole)).run()
+    assert np.isfinite(metrics["loss"]).all() and not metrics["nonfinite"].any()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.pool.cloth)))
+
+
+def _two_pieces(garment: Garment) -> Garment:
+    """A garment, and the same again 2 cm outside of it, joined nowhere."""
+    outside = garment.vertices + 0.02 * np.sign(garment.vertices) * np.array([1, 0, 1], np.float32)
+    count = len(garment.vertices)
+    return Garment(
+        vertices=np.concatenate([garment.vertices, outside.astype(np.float32)]),
+        faces=np.concatenate([garment.faces, garment.faces + count]),
+        **{k: np.concatenate([getattr(garment, k)] * 2) for k in ("weights", "shapedirs", "pinned")},
+    )
+
+
+def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
+    small = garments.build("tshirt", 300, whole.body, whole.names)
+    count = len(small.vertices)
+    assert abs(count - 300) < 30
+    double = _of(whole, _two_pieces(small))
+    _takes_a_step(double)
+    basis = scene.laplacian_basis(double.scene, 6, 5.0, 0.2, 1 / 30).reshape(6, -1)
+    for piece in (slice(0, count), slice(count, None)):  # to move one of them alone is in the span of the basis
+        alone = np.zeros((2 * count, 3), np.float32)
+        alone[piece, 0] = 1.0
+        weights, *_ = np.linalg.lstsq(basis.T, alone.reshape(-1), rcond=None)
+        np.testing.assert_allclose(basis.T @ weights, alone.reshape(-1), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_large_garment_trains(whole):
+    large = garments.build("tshirt", 20000, whole.body, whole.names)
+    assert abs(len(large.vertices) / 20000 - 1) < 0.1
+    _takes_a_step(_of(whole, large))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", scenes.SCENES)
+def test_every_scene_trains(whole, name):
+    _takes_a_step(scenes.build(whole, name))
+
+
+def test_the_basis_is_the_dense_solvers(whole):
+    """Modes, and their scale, from the textbook's dense matrices."""
+    count, stiffness, density, timestep = 12, 5.0, 0.2, 1 / 30
+    basis = scene.laplacian_basis(whole.scene, count, stiffness, density, timestep)[::3, :, 0]
+    vertices = np.asarray(whole.garment.vertices, np.float64)
+    matrix, mass = np.zeros((len(vertices),) * 2), np.zeros(len(vertices))
+    for face in whole.garment.faces:
+        a, b, c = vertices[face]
+        mass[face] += density * np.linalg.norm(np.cross(b - a, c - a)) / 6
+        for i, j in zip(face, np.roll(face, 1)):
+            matrix[i, j] = matrix[j, i] = -stiffness
+    np.fill_diagonal(matrix, -matrix.sum(axis=1))
+    values = np.linalg.eigvalsh(matrix / np.sqrt(mass[:, None] * mass[None]))[: count // 3]
+    energy = (
+        np.einsum("kv,vw,lw->kl", basis, matrix, basis) + np.einsum("kv,v,lv->kl", basis, mass, basis) / timestep**2
+    )
+    np.testing.assert_allclose(energy, np.eye(count // 3), atol=1e-4)  # each costs 1 J, and none helps another
+    quotients = np.einsum("kv,vw,kw->k", basis, matrix, basis) / np.einsum("kv,v,kv->k", basis, mass, basis)
+    np.testing.assert_allclose(quotients, values, rtol=1e-4, atol=1e-4)
