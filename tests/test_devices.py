@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
-from toy import small
+from toy import assert_same, small
 
 from clothjax import checkpoint, configuration, devices
 from clothjax.config import Config
@@ -32,7 +32,7 @@ def test_how_processes_are_named(monkeypatch):
     devices.connect("node1:4000,3,2")
     assert joined.pop() == ("node1:4000", 3, 2)
     for wrong in ("node1:4000", "node1,2,0", "node1:4000,two,0"):
-        with pytest.raises(ValueError, match="processes are ADDRESS:PORT,COUNT,INDEX"):
+        with pytest.raises(ValueError, match="processes are given as ADDRESS:PORT,COUNT,INDEX"):
             devices.connect(wrong)
     with pytest.raises(ValueError, match="process 2 of 2: indices count from 0"):
         devices.connect("node1:4000,2,2")
@@ -108,27 +108,41 @@ def finish(*processes, seconds=400):
     return outputs
 
 
-def trained(directory):
-    """What a training left: the parameters of Phi and of Psi."""
-    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in ("stage1", "stage2")]
+ONE_AND_FOUR = """
+import sys
+import jax
+import numpy as np
+from clothjax import configuration, devices, experiment, stage1, stage2
+from clothjax.config import Config
+
+config = configuration.cli(Config, [sys.argv[1]])
+whole = experiment.assemble(config)
+reel, _ = experiment.training_clips(whole)
+after, teachers = [], []
+for mesh in (None, devices.choose("auto", config.stage1.batch)):
+    state = devices.copied(stage1.init(whole.scene, reel, config), mesh)
+    state, metrics = stage1.make_update(whole.scene, reel, config, 1, 1, mesh)(state)
+    after.append(jax.device_get((state.params, state.pool.cloth, metrics["loss"])))
+    model = devices.copied(jax.device_get({"params": state.params, "statistics": state.statistics}), mesh)
+    teachers.append(stage2.teach(model, whole.scene, reel, np.arange(5), config, devices=mesh)[0])
+print(len(jax.devices()), "devices")
+for one, four in zip(jax.tree.leaves(after[0]), jax.tree.leaves(after[1]), strict=True):
+    np.testing.assert_allclose(one, four, rtol=1e-5, atol=5e-6)
+for one, four in zip(jax.tree.leaves(after[0][0]), jax.tree.leaves(after[1][0]), strict=True):
+    np.testing.assert_allclose(one, four, rtol=0, atol=1e-6)
+for one, four in zip(teachers[0], teachers[1], strict=True):
+    np.testing.assert_allclose(one, four, rtol=0, atol=3e-3 * max(1.0, np.abs(one).max()))
+"""
 
 
-def assert_close(one, other):
-    """Equal to 1e-6 of the largest parameter of each kind."""
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * max(1.0, float(np.abs(a).max())))
-
-
-@pytest.fixture(scope="module")
-def alone(config):
-    finish(start(config, config.parent / "alone"))
-    return trained(config.parent / "alone")
-
-
-def test_four_devices_train_as_one(config, alone):
-    (output,) = finish(start(config, config.parent / "four", "--devices", "auto", count=4))
-    assert "4 devices, 1 processes" in output
-    assert_close(alone, trained(config.parent / "four"))
+def test_four_devices_take_the_step_of_one(config):
+    """Parameters to 1e-6 after one update; after that Adam turns rounding into whole steps. Teachers likewise."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_AND_FOUR, str(config)], capture_output=True, text=True, cwd=ROOT, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert "4 devices" in done.stdout
 
 
 def free_port() -> int:
@@ -142,30 +156,45 @@ def pair(config, directory, *arguments):
     return [start(config, directory, "--processes", f"{address},2,{index}", *arguments) for index in range(2)]
 
 
-def test_two_processes_train_and_save_together(config, alone):
+def trained(directory):
+    """What a training left: the parameters of Phi and of Psi."""
+    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in ("stage1", "stage2")]
+
+
+@pytest.mark.slow
+def test_two_processes_train_and_save_as_one_with_two_devices(config):
     first, second = finish(*pair(config, config.parent / "two"))
     assert "2 devices, 2 processes" in first and "step 20/20" in first
     assert "step 20/20" not in second  # one of them reports
-    assert_close(alone, trained(config.parent / "two"))
+    (one,) = finish(start(config, config.parent / "one", "--devices", "auto", count=2))
+    assert "2 devices, 1 processes" in one
+    assert_same(trained(config.parent / "one"), trained(config.parent / "two"))
 
 
-@pytest.mark.parametrize("killed", [0, 1])
+@pytest.mark.parametrize("killed", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_one_killed_stops_the_other_which_says_how_to_go_on(config, killed):
+    """In the second stage: the checkpoint of the first is there, and with it both can go on."""
     directory = config.parent / f"killed_{killed}"
-    processes = pair(config, directory, "--stage1.steps", "100000")
-    checkpoints = directory / "stage1" / "checkpoints"
-    for _ in range(1200):
-        if checkpoint.steps(checkpoints) or any(process.poll() is not None for process in processes):
-            break
-        time.sleep(0.1)
-    processes[killed].send_signal(signal.SIGKILL)
-    processes[killed].communicate()
-    output, _ = processes[1 - killed].communicate(timeout=120)
+    processes = pair(config, directory, "--stage2.steps", "1000000")
+    try:
+        rows = directory / "stage2" / "metrics.jsonl"
+        for _ in range(3000):
+            if (rows.exists() and rows.stat().st_size) or any(process.poll() is not None for process in processes):
+                break
+            time.sleep(0.1)
+        processes[killed].send_signal(signal.SIGKILL)
+        processes[killed].communicate()
+        output, _ = processes[1 - killed].communicate(timeout=150)
+    finally:
+        for process in processes:
+            process.kill()
     assert processes[1 - killed].returncode not in (0, None), output
-    assert "another process of this training is gone" in output and "start all of them again" in output, output
-    assert checkpoint.steps(checkpoints), output
-    step = checkpoint.latest(checkpoints).step
-    assert 0 < step < 100000
+    # where the first is gone, jax itself may be faster to say so
+    said = "another process of this training is gone" in output and "start all of them again" in output
+    assert said or (killed == 0 and "another task died" in output), output
+    assert checkpoint.latest(directory / "stage1" / "checkpoints").step == 20
+    parts, _ = checkpoint.read(directory / "stage1" / "checkpoints", "average", "pool")
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parts["average"]))
 
 
 def test_the_default_is_one_device_and_one_process():
