@@ -216,19 +216,16 @@ def make_update(
     stage = config.stage1
     transform = optimizer(config)
 
-    def loss_of(params, statistics, simulation, step, clips):
-        character = wearer(scene, simulation.betas, simulation.material, config)
-        return rollout.training_rollout(
-            params, statistics, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
-            step, frames, config,
-        )  # fmt: skip
+    def part(simulations, params, statistics, step, clips):
+        def loss(params, simulation):
+            character = wearer(scene, simulation.betas, simulation.material, config)
+            return rollout.training_rollout(
+                params, statistics, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
+                step, frames, config,
+            )  # fmt: skip
 
-    def batch_loss(params, statistics, simulations, step, clips):
-        def each(simulations, params, statistics, step, clips):
-            return _each(lambda one: loss_of(params, statistics, one, step, clips), simulations)
-
-        loss, rest = spread.split(each, devices)(simulations, params, statistics, step, clips)
-        return jnp.mean(loss), (loss, rest)
+        found, gradient = losses_and_gradient(loss, params, simulations)
+        return found, jax.tree.map(lambda x: x[None], gradient)
 
     def one(clips: Clips, state: TrainingState, _):
         begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
@@ -243,11 +240,15 @@ def make_update(
 
         simulations = jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
 
-        (loss, (each, (cloth, terms, seen))), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
-            state.params, state.statistics, simulations, state.step, clips
+        (each, (cloth, terms, seen)), gradients = spread.split(part, devices)(
+            simulations, state.params, state.statistics, state.step, clips
         )
         weights, metrics = fit.descend(
-            transform, Weights(state.params, state.average, state.optimizer), loss, gradient, stage.ema
+            transform,
+            Weights(state.params, state.average, state.optimizer),
+            jnp.mean(each),
+            jax.tree.map(lambda x: jnp.mean(x, axis=0), gradients),  # over devices
+            stage.ema,
         )
         # a blown-up simulation starts anew at its next turn; so does one whose update was skipped
         lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0) | ~jnp.isfinite(each)
@@ -282,13 +283,31 @@ def make_update(
     return lambda state: update(state, clips)
 
 
-def _each(function: Callable, stacked):
-    """`function` of every element of a stack: on a CPU one after the other, since side by side slows searches."""
+def losses_and_gradient(loss: Callable, params: dict, batch):
+    """Losses [N] of the elements of a batch with all else that `loss` returns, and the gradient of their mean.
+
+    On a CPU one after the other: side by side the searches for contact are slower, and it takes N times the memory.
+    """
     if jax.default_backend() != "cpu":
-        return jax.vmap(function)(stacked)
-    if len(jax.tree.leaves(stacked)[0]) > 1:
-        return jax.lax.map(function, stacked)
-    return jax.tree.map(lambda x: x[None], function(jax.tree.map(lambda x: x[0], stacked)))
+
+        def mean(params):
+            losses, rest = jax.vmap(lambda one: loss(params, one))(batch)
+            return jnp.mean(losses), (losses, rest)
+
+        (_, found), gradient = jax.value_and_grad(mean, has_aux=True)(params)
+        return found, gradient
+
+    single, count = jax.value_and_grad(loss, has_aux=True), len(jax.tree.leaves(batch)[0])
+    if count == 1:
+        found, gradient = single(params, jax.tree.map(lambda x: x[0], batch))
+        return jax.tree.map(lambda x: x[None], found), gradient
+
+    def add(total, one):
+        found, gradient = single(params, one)
+        return jax.tree.map(jnp.add, total, gradient), found
+
+    total, found = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), batch)
+    return found, jax.tree.map(lambda x: x / count, total)
 
 
 def _where(condition: Array, new: Array, old: Array) -> Array:

@@ -49,9 +49,16 @@ def training_step(quick: bool) -> dict:
     config = configuration.cli(Config, QUICK if quick else PAPER)
     small = configuration.cli(Config, [*SCENES, "--garment", config.garment])
     rounds = 3 if quick else 5
-    report = stage1.measure(config, rounds)
-    report |= scaling.measure(config, rounds, scaling.SMALL if quick else scaling.SIZES)
-    return report | {"scenes": scenes.measure(small, rounds)}
+    parts = {
+        "the processor, the convolution, compilation, the step": lambda: stage1.measure(config, rounds),
+        "growth with the vertices": lambda: scaling.measure(config, rounds, scaling.SMALL if quick else scaling.SIZES),
+        "scenes": lambda: {"scenes": scenes.measure(small, rounds)},
+    }
+    report = {}
+    for name, measure in parts.items():
+        print(f"measuring {name}", flush=True)
+        report |= measure()
+    return report
 
 
 def machine() -> dict:

@@ -152,16 +152,23 @@ def test_the_rollout_grows_with_the_curriculum():
     assert [stage1.rollout_length(step, config) for step in (0, 4999, 5000, 20000, 10**6)] == [1, 1, 2, 5, 5]
 
 
-def test_one_alone_is_treated_like_one_of_many():
-    stack = {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_losses_and_the_gradient_of_their_mean(monkeypatch, count, backend):
+    monkeypatch.setattr(stage1.jax, "default_backend", lambda: backend)
+    params, batch = (
+        {"w": jnp.array([1.0, -2.0])},
+        {"x": jnp.arange(2.0 * count).reshape(count, 2), "n": jnp.arange(count)},
+    )
 
-    def function(one):
-        return jnp.sum(one["a"]) * 2.0, one["b"] + 1
+    def loss(params, one):
+        return jnp.sum((params["w"] * one["x"]) ** 2), one["n"] + 1
 
-    many = stage1._each(function, stack)
-    for index in range(3):
-        alone = stage1._each(function, jax.tree.map(lambda x, i=index: x[i : i + 1], stack))
-        assert_same(alone, jax.tree.map(lambda x, i=index: x[i : i + 1], many))
+    (losses, rest), gradient = stage1.losses_and_gradient(loss, params, batch)
+    x = np.asarray(batch["x"])
+    np.testing.assert_allclose(losses, ((np.array([1.0, -2.0]) * x) ** 2).sum(axis=1))
+    np.testing.assert_array_equal(rest, np.arange(count) + 1)
+    np.testing.assert_allclose(gradient["w"], 2 * np.array([1.0, -2.0]) * (x**2).mean(axis=0), rtol=1e-6)
 
 
 def test_materials_are_drawn_from_their_ranges():

@@ -12,6 +12,7 @@ from clothjax.experiment import Experiment
 from clothjax.types import Motion
 from experiments.benchmarks import timing
 from experiments.benchmarks.timing import cost, interleaved, program
+from experiments.session import progress
 
 Change = Callable[[Experiment], Experiment]
 POLE = 0.05  # of the width, held by the pole
@@ -90,20 +91,14 @@ def measure(config: Config, rounds: int) -> dict:
     """Flops, bytes and seconds of a training step in each scene, and their ratio to the full one's."""
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
     whole = experiment.assemble(config)
-    programs, counted = {}, {}
-    for name in SCENES:
-        step, state = update(build(whole, name))
-        programs[name] = program(step, state)
-        with timing.unrolled():
-            counted[name] = cost(program(step, state))
+    programs = {}
+    with timing.unrolled(), progress("compiling each scene", len(SCENES)) as report:
+        for name in SCENES:
+            programs[name] = program(*update(build(whole, name)))
+            report(len(programs))
     seconds = interleaved(programs, rounds)
+    figures = {name: {**cost(one), "seconds": seconds[name]} for name, one in programs.items()}
     return {
-        name: {
-            **counted[name],
-            "seconds": seconds[name],
-            "flops_ratio": counted[name]["flops"] / counted["full"]["flops"],
-            "bytes_ratio": counted[name]["bytes"] / counted["full"]["bytes"],
-            "seconds_ratio": seconds[name] / seconds["full"],
-        }
-        for name in SCENES
+        name: {**each, **{f"{key}_ratio": each[key] / figures["full"][key] for key in each}}
+        for name, each in figures.items()
     }

@@ -23,6 +23,7 @@ from clothjax.losses import TimeStep
 from clothjax.types import ClothState
 from experiments.benchmarks import textbook, timing
 from experiments.benchmarks.timing import against_peaks, cost, interleaved, program, temporary_bytes
+from experiments.session import progress
 
 CONVOLUTION = (32, 64)  # channels at which the kernel of every vertex and neighbour fits into memory
 COMPILED_FRAMES = 3  # of the rollout whose compilation is timed
@@ -46,10 +47,13 @@ def measure(config: Config, rounds: int) -> dict:
     whole = experiment.assemble(config)
     moment = first_moment(whole)
     report = {"vertices": len(whole.garment.vertices), "width": config.model.width}
-    report |= processor(whole, moment, rounds)
-    report |= convolution(whole, rounds)
-    report |= compilation(whole)
-    return report | step(whole, moment, rounds)
+    parts = (lambda: processor(whole, moment, rounds), lambda: convolution(whole, rounds), lambda: compilation(whole),
+             lambda: step(whole, moment, rounds))  # fmt: skip
+    with progress("measuring", len(parts)) as done:
+        for index, part in enumerate(parts):
+            report |= part()
+            done(index + 1)
+    return report
 
 
 def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
