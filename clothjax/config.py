@@ -38,9 +38,6 @@ class MaterialConfig:
     """Draw materials from the ranges in training; false keeps the single values."""
 
 
-Energy = Literal["stretching", "bending", "gravity", "inertia", "friction", "collision"]
-
-
 @dataclass(frozen=True)
 class PhysicsConfig:
     """What acts on the cloth, and the constants that do not belong to it.
@@ -50,7 +47,7 @@ class PhysicsConfig:
 
     body: Literal["moving", "still", "none"] = "moving"
     """Whether there is a body to touch, and whether it moves. Where there is none, the rig only carries the pins."""
-    without: tuple[Energy, ...] = ()
+    without: tuple[Literal["bending", "gravity", "friction"], ...] = ()
     """Energies that the scene does not have."""
     collision_stiffness: float = 1e5  # J/m^3, of the cubic penetration
     collision_offset: float = 3e-3  # m

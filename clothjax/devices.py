@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 AXIS = "simulations"
-CLUSTERS = {"SLURM_NTASKS": "SLURM_PROCID", "OMPI_COMM_WORLD_SIZE": "OMPI_COMM_WORLD_RANK"}
 
 Tree = TypeVar("Tree")
 
@@ -21,17 +22,20 @@ def connect(processes: str = "") -> None:
     """Joins this process to the others of its training, before anything is computed.
 
     Args:
-        processes: `ADDRESS:PORT,COUNT,INDEX` of the first process, of all, and of this one. By default those of a
-            SLURM, Open MPI or Kubernetes job (an indexed one), if this is one of several processes in it.
+        processes: `ADDRESS:PORT,COUNT,INDEX` of the first process, of all, and of this one; `alone`; by default, those
+            of a SLURM, Open MPI (up to 4) or Kubernetes job (an indexed one), if there are several.
 
     Raises:
         ValueError: if `processes` is something else.
     """
+    if processes == "alone":
+        return
     if processes:
         address, *numbers = processes.split(",")
         if len(numbers) != 2 or ":" not in address or not all(number.isdecimal() for number in numbers):
             raise ValueError(
-                f"processes are given as ADDRESS:PORT,COUNT,INDEX, such as node1:4000,2,0; got {processes!r}"
+                "processes are given as ADDRESS:PORT,COUNT,INDEX, such as node1:4000,2,0, or as `alone`; "
+                f"got {processes!r}"
             )
         count, index = map(int, numbers)
         if index >= count:
@@ -42,30 +46,33 @@ def connect(processes: str = "") -> None:
 
 
 def _is_one_of_several() -> bool:
-    several = any(int(os.environ.get(size, 1)) > 1 and rank in os.environ for size, rank in CLUSTERS.items())
-    return several or {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= os.environ.keys()
+    """Whether a launcher that jax knows started this process beside others. SLURM's batch script itself is alone."""
+    slurm = int(os.environ.get("SLURM_STEP_NUM_TASKS", 1))
+    mpi = int(os.environ.get("OMPI_COMM_WORLD_SIZE", 1)) if "OMPI_MCA_orte_hnp_uri" in os.environ else 1
+    return max(slurm, mpi) > 1 or {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= os.environ.keys()
 
 
 @contextlib.contextmanager
 def together(directory: Path) -> Iterator[None]:
-    """Within it, this process ends when another of its training is gone: they cannot go on without each other.
+    """Within it, of several processes none outlives an error in one: they cannot go on without each other.
 
     Args:
         directory: of the run, whose checkpoints are whole and can be resumed from.
     """
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
+    except Exception as error:
         if jax.process_count() == 1:
             raise
-        reason = str(error).splitlines()[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         print(
-            f"error: another process of this training is gone ({reason}); start all of them again to go on from the "
-            f"last checkpoint in {directory}",
+            f"error: {reason}\nprocess {jax.process_index()} of {jax.process_count()} stops, and the others cannot go "
+            "on without it, if they are not gone already; when that is mended, start all of them again: they resume "
+            f"from the last checkpoint in {directory}",
             file=sys.stderr,
             flush=True,
         )
-        os._exit(1)  # at a normal exit jax would wait for the lost one
+        os._exit(1)  # at a normal exit jax would wait for the others
 
 
 def choose(wanted: str, *batches: int) -> Mesh | None:
@@ -96,35 +103,37 @@ def choose(wanted: str, *batches: int) -> Mesh | None:
     return None if count == 1 else Mesh(np.array(there[:count]), (AXIS,))
 
 
-def split(function: Callable, devices: Mesh | None) -> Callable:
+def shard(function: Callable, device_mesh: Mesh | None) -> Callable:
     """`function` of a batch, each device having a part: its first argument and its results have a leading axis [N]."""
-    if devices is None:
+    if device_mesh is None:
         return function
 
     def run(batch, *others):
-        there = PartitionSpec(AXIS)
+        part, whole = PartitionSpec(AXIS), PartitionSpec()
+        specs = (part, *[whole] * len(others))
         # nothing is communicated within, so there is nothing to check
-        each = jax.shard_map(
-            function, mesh=devices, in_specs=(there, *[PartitionSpec()] * len(others)), out_specs=there, check_vma=False
-        )
+        each = jax.shard_map(function, mesh=device_mesh, in_specs=specs, out_specs=part, check_vma=False)
         return each(batch, *others)
 
     return run
 
 
-def replicated(devices: Mesh | None) -> NamedSharding | None:
+def replicated(device_mesh: Mesh | None) -> NamedSharding | None:
     """The sharding of what every device has a copy of."""
-    return None if devices is None else NamedSharding(devices, PartitionSpec())
+    return None if device_mesh is None else NamedSharding(device_mesh, PartitionSpec())
 
 
-def copied(tree: Tree, devices: Mesh | None) -> Tree:
-    """Arrays that every process has, on every device."""
-    if devices is None:
-        return jax.tree.map(jax.numpy.asarray, tree)
+def replicate(tree: Tree, device_mesh: Mesh | None) -> Tree:
+    """The arrays of the first process on every device of all."""
+    if device_mesh is None:
+        return jax.tree.map(jnp.asarray, tree)
 
     def one(leaf):
         if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(one(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
-        return jax.device_put(np.asarray(leaf), replicated(devices))
+        leaf = np.asarray(leaf)
+        if jax.process_count() > 1:  # each has computed it, on another machine with other rounding
+            leaf = np.asarray(multihost_utils.broadcast_one_to_all(leaf))
+        return jax.device_put(leaf, replicated(device_mesh))
 
     return jax.tree.map(one, tree)

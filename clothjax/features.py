@@ -163,7 +163,8 @@ def scaled(value: Array, limits) -> Array:
 def _canonical(
     character: Character, state: ClothState, window: Window, contact: Contact | None, held: Array, force: Array
 ):
-    """The state as the next frame's canonical pose sees it, [V, 22]; and where it would be if nothing pushed.
+    """The state as the next frame's canonical pose sees it, [V, 22], or [V, 15] without a body; and where it would be
+    if nothing pushed.
 
     `held` keeps the canonical displacement, `drifted` keeps the velocity: the two guesses between which, roughly,
     the next position lies. Contact is measured from both; the force at `held` says where to go from there, over the
@@ -181,10 +182,11 @@ def _canonical(
         skinning.unapply_direction(following, pull),
         skinning.unapply(following, drifted) - character.template,
         skinning.unapply_direction(following, down),
-        character.template,
     ]
     if contact is not None:
         columns.append(skinning.unapply_direction(following, contact.normal_next))
+    columns.append(character.template)
+    if contact is not None:
         gaps = [contacts.distance(x, contact.point_next, contact.normal_next)[:, None] for x in (held, drifted)]
         columns += [jnp.clip(gap, -0.05, 0.05) for gap in gaps]
         columns += [jnp.maximum(0.003 - gap, 0.0) for gap in gaps]

@@ -94,6 +94,8 @@ def fit(
     with lock, _interrupts() as interrupted, _advice(checkpoints):
         state = _resume(checkpoints, state, config, may_differ)
         first = _step(state)
+        if first != _anywhere(first) or first != -_anywhere(-first):
+            raise ValueError(f"{directory} must be on a file system that all processes of a training share")
         seconds, compile_seconds = run_folder.read_seconds(directory) if first else (0.0, 0.0)
         rows = run_folder.metrics_file(directory, first) if leader else contextlib.nullcontext(lambda row: None)
         saved = time.monotonic()

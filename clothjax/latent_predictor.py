@@ -60,16 +60,20 @@ def pose_inputs(
 
 
 def constant_inputs(betas: Array, material: Material, config: MaterialConfig) -> Array:
-    """Betas [S] and the material scaled to [0, 1]: what does not change while a character wears a garment."""
+    """Betas [S] and the material scaled to [0, 1] [4]: what does not change while a character wears a garment.
+
+    Where all garments are of one material it is no input.
+    """
+    if not config.sample:
+        return betas
     density = features.scaled(material.density, config.density_range)
     return jnp.concatenate([betas, density[None], features.material_inputs(material, config)])
 
 
 def bounded_constants(constants: Array, config: Config) -> tuple[Array, Array]:
-    """Constants [S + 4] brought into the range that they are drawn from in training, and whether they were there."""
-    count = constants.shape[0] - len(Material._fields)
-    betas = jnp.full(count, config.stage1.betas)
-    materials = jnp.ones(len(Material._fields))
+    """Constants of `constant_inputs` brought into the range that training draws from, and whether they were there."""
+    materials = jnp.ones(len(Material._fields) if config.material.sample else 0)
+    betas = jnp.full(len(constants) - len(materials), config.stage1.betas)
     return bounded(constants, jnp.concatenate([-betas, 0 * materials]), jnp.concatenate([betas, materials]))
 
 

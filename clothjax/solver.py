@@ -143,15 +143,11 @@ def solve_step(
 
 
 def _present(step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[TimeStep, Mesh]:
-    """The step and the mesh without the elements of energies that the scene does not have."""
-    rest = step.rest
-    if "stretching" in config.without:
-        mesh = mesh._replace(faces=mesh.faces[:0])
-        rest = rest._replace(inverse=rest.inverse[:0], face_area=rest.face_area[:0])
-    if "bending" in config.without:
-        mesh = mesh._replace(hinges=mesh.hinges[:0])
-        rest = rest._replace(hinge_area=rest.hinge_area[:0], hinge_angle=rest.hinge_angle[:0])
-    return step._replace(rest=rest), mesh
+    """The step and the mesh without the hinges of a scene that has no bending."""
+    if "bending" not in config.without:
+        return step, mesh
+    rest = step.rest._replace(hinge_area=step.rest.hinge_area[:0], hinge_angle=step.rest.hinge_angle[:0])
+    return step._replace(rest=rest), mesh._replace(hinges=mesh.hinges[:0])
 
 
 def hessians(
@@ -281,7 +277,7 @@ def _condition(x: Array, step: TimeStep, mesh: Mesh, free: Array) -> tuple[Array
     strain = physics.green_strain(x[mesh.faces], step.rest.inverse)
     mean, spread = 0.5 * (strain[:, 0, 0] + strain[:, 1, 1]), 0.5 * (strain[:, 0, 0] - strain[:, 1, 1])
     largest = mean + jnp.sqrt(spread * spread + strain[:, 0, 1] * strain[:, 0, 1])
-    stretch = jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest, initial=0.0), 0.0))
+    stretch = jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest), 0.0))
     depth = jnp.zeros((), x.dtype)
     if step.contact is not None:
         distance = contact.distance(x, step.contact.point_next, step.contact.normal_next)

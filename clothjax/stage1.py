@@ -11,8 +11,7 @@ from jax.sharding import Mesh
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, fit, losses, rollout
-from clothjax import devices as spread
+from clothjax import compact_latent, devices, fit, losses, rollout
 from clothjax.character import Character
 from clothjax.clips import Clips
 from clothjax.config import Config, Range
@@ -192,7 +191,7 @@ def rollout_length(step: int, config: Config) -> int:
 
 
 def make_curriculum(
-    scene: Scene, clips: Clips, config: Config, steps: int, devices: Mesh | None = None
+    scene: Scene, clips: Clips, config: Config, steps: int, device_mesh: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """`make_update` with the rollout growing as training proceeds; one compilation for each length."""
     made = {}
@@ -200,14 +199,14 @@ def make_curriculum(
     def update(state: TrainingState):
         frames = rollout_length(int(state.step), config)
         if frames not in made:
-            made[frames] = make_update(scene, clips, config, frames, steps, devices)
+            made[frames] = make_update(scene, clips, config, frames, steps, device_mesh)
         return made[frames](state)
 
     return update
 
 
 def make_update(
-    scene: Scene, clips: Clips, config: Config, frames: int, steps: int, devices: Mesh | None = None
+    scene: Scene, clips: Clips, config: Config, frames: int, steps: int, device_mesh: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """A jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
 
@@ -240,7 +239,7 @@ def make_update(
 
         simulations = jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
 
-        (each, (cloth, terms, seen)), gradients = spread.split(part, devices)(
+        (each, (cloth, terms, seen)), gradients = devices.shard(part, device_mesh)(
             simulations, state.params, state.statistics, state.step, clips
         )
         weights, metrics = fit.descend(
@@ -275,11 +274,11 @@ def make_update(
         metrics |= {name: jnp.mean(values) for name, values in terms.items()}
         return new, metrics
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=spread.replicated(devices))
+    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
     def update(state, clips):
         return jax.lax.scan(partial(one, clips), state, None, length=steps)
 
-    clips = spread.copied(clips, devices)
+    clips = devices.replicate(clips, device_mesh)
     return lambda state: update(state, clips)
 
 
@@ -288,6 +287,12 @@ def losses_and_gradient(loss: Callable, params: dict, batch):
 
     On a CPU one after the other: side by side the searches for contact are slower, and it takes N times the memory.
     """
+    single = jax.value_and_grad(loss, has_aux=True)
+    count = len(jax.tree.leaves(batch)[0])
+    if count == 1:
+        found, gradient = single(params, jax.tree.map(lambda x: x[0], batch))
+        return jax.tree.map(lambda x: x[None], found), gradient
+
     if jax.default_backend() != "cpu":
 
         def mean(params):
@@ -296,11 +301,6 @@ def losses_and_gradient(loss: Callable, params: dict, batch):
 
         (_, found), gradient = jax.value_and_grad(mean, has_aux=True)(params)
         return found, gradient
-
-    single, count = jax.value_and_grad(loss, has_aux=True), len(jax.tree.leaves(batch)[0])
-    if count == 1:
-        found, gradient = single(params, jax.tree.map(lambda x: x[0], batch))
-        return jax.tree.map(lambda x: x[None], found), gradient
 
     def add(total, one):
         found, gradient = single(params, one)

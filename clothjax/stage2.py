@@ -14,8 +14,7 @@ import optax
 from jax.sharding import Mesh
 
 from clothjax import clips as motion
-from clothjax import devices as spread
-from clothjax import fit, garment_model, latent_predictor, rollout, stage1
+from clothjax import devices, fit, garment_model, latent_predictor, rollout, stage1
 from clothjax.clips import Clips
 from clothjax.config import Config, ModelConfig
 from clothjax.fit import Weights
@@ -54,7 +53,7 @@ def teach(
     kept: np.ndarray,
     config: Config,
     progress: Callable = lambda done: None,
-    devices: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> tuple[Teacher, float]:
     """Rolls Phi out on random clips, bodies and materials; also tells the seconds it took.
 
@@ -62,12 +61,12 @@ def teach(
         model: Phi's `params` and `statistics`.
         kept: joints that are inputs.
         progress: called with the number of sequences done.
-        devices: each rolls out a part of the sequences.
+        device_mesh: each device rolls out a part of the sequences.
     """
     stage = config.stage2
     fps = config.fps
     began = time.monotonic()
-    clips = spread.copied(clips, devices)
+    clips = devices.replicate(clips, device_mesh)
 
     def sequence(key: Array, model: dict, clips: Clips):
         simulation = stage1.begin(key, scene, clips, config)
@@ -86,17 +85,17 @@ def teach(
         first = jnp.zeros_like(latents[:1])
         return jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants
 
-    rollouts = spread.split(jax.vmap(sequence, (0, None, None)), devices)
-    run = jax.jit(rollouts, out_shardings=spread.replicated(devices))
+    rollouts = devices.shard(jax.vmap(sequence, (0, None, None)), device_mesh)
+    run = jax.jit(rollouts, out_shardings=devices.replicated(device_mesh))
     keys = jax.random.split(jax.random.key(stage.seed + 1), stage.sequences)
-    alone = devices is None
+    alone = device_mesh is None
     on_cpu = jax.default_backend() == "cpu"
-    among = 1 if alone else devices.size
+    among = 1 if alone else device_mesh.size
     size = among * min(ON_CPU if on_cpu else ELSEWHERE, -(-stage.sequences // among))
 
     def some(start: int):
         rows = np.arange(start, start + size) % stage.sequences
-        return jax.device_get(run(spread.copied(keys[rows], devices), model, clips))
+        return jax.device_get(run(devices.replicate(keys[rows], device_mesh), model, clips))
 
     parts = []
     # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
@@ -196,7 +195,7 @@ def rollout_loss(
 
 
 def make_update(
-    teacher: Teacher, config: Config, steps: int, devices: Mesh | None = None
+    teacher: Teacher, config: Config, steps: int, device_mesh: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """A jitted function that takes `steps` training steps, and their metrics [steps]; it consumes its argument.
 
@@ -218,7 +217,7 @@ def make_update(
             constants = teacher.constants[sequence]
             return rollout_loss(params, state, latents, poses, constants, key, config)
 
-        each = spread.split(jax.vmap(one, (0, None, None, None)), devices)
+        each = devices.shard(jax.vmap(one, (0, None, None, None)), device_mesh)
         return jnp.mean(each((which, begin, jax.random.split(keys[2], stage.batch)), params, state, teacher))
 
     def one(teacher: Teacher, state: TrainingState, _):
@@ -229,9 +228,9 @@ def make_update(
         )
         return state._replace(step=state.step + 1, **weights._asdict()), metrics
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=spread.replicated(devices))
+    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
     def update(state, teacher):
         return jax.lax.scan(partial(one, teacher), state, None, length=steps)
 
-    teacher = spread.copied(teacher, devices)
+    teacher = devices.replicate(teacher, device_mesh)
     return lambda state: update(state, teacher)

@@ -72,7 +72,7 @@ def energies(scene: Scene, position: np.ndarray) -> dict[str, float]:
     step = engine.time_step()._replace(position=scene.start)
     with jax.enable_x64(True):
         terms = losses.energies(position, step, scene.mesh, CONFIG)
-    return {name: 1e3 * float(terms[name]) for name in ("stretching", "bending", "gravity", "collision")}
+    return {name: 1e3 * float(terms.get(name, 0.0)) for name in ("stretching", "bending", "gravity", "collision")}
 
 
 def pins(scene: Scene, position: np.ndarray) -> float:

@@ -55,7 +55,8 @@ class Reference:
 
     def __init__(self, scene: Scene, timestep: float, disturbance: float = 0.0):
         noise = np.random.default_rng(0).standard_normal(scene.start.shape)
-        self.scene, self.timestep, self.rest = scene, np.float64(timestep), at_rest(scene)
+        self.scene, self.timestep = scene, np.float64(timestep)
+        self.rest, self.mass = at_rest(scene), masses(scene)
         self.position = np.where(scene.pinned[:, None], scene.start, scene.start + disturbance * noise)
         self.velocity = np.zeros_like(self.position)
         self.converged = True
@@ -71,7 +72,7 @@ class Reference:
         return TimeStep(
             position=self.position,
             velocity=self.velocity,
-            mass=masses(self.scene),
+            mass=self.mass,
             rest=self.rest,
             material=MATERIAL,
             contact=contact,

@@ -110,7 +110,8 @@ def body_trajectory(whole: Experiment, clip: Motion) -> tuple[np.ndarray, np.nda
 
 
 def _dressed(whole: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
-    return [Surface(body, whole.body.faces, SKIN), Surface(garment, whole.garment.faces)]
+    cloth = [Surface(garment, whole.garment.faces)]
+    return [Surface(body, whole.body.faces, SKIN), *cloth] if whole.scene.touchable else cloth
 
 
 if __name__ == "__main__":

@@ -29,10 +29,16 @@ def fail_clearly() -> Iterator[None]:
         raise SystemExit(1) from None
 
 
+def say(text: str) -> None:
+    """Prints a line, of several processes only in the first."""
+    if jax.process_index() == 0:
+        print(text, flush=True)
+
+
 @contextlib.contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function to call with the amount done: a bar on a terminal, a line every ten seconds elsewhere."""
-    terminal = sys.stderr.isatty()
+    terminal = sys.stderr.isatty() and jax.process_index() == 0
     last = time.monotonic()
     with tqdm(total=total, desc=what, disable=not terminal, leave=False) as bar:
 
@@ -41,6 +47,6 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
             bar.update(done - bar.n)
             if not terminal and (time.monotonic() - last > 10 or done == total):
                 last = time.monotonic()
-                print(f"{what}: {done}/{total}", flush=True)
+                say(f"{what}: {done}/{total}")
 
         yield report

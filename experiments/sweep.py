@@ -4,20 +4,21 @@
     python -m experiments.sweep configs/quickstart.yaml --seeds 0 1 2 --stage1.steps 20000        # settings for all
     python -m experiments.sweep configs/paper_tshirt.yaml --seeds 0 1 2 --slurm partition=gpu gpus_per_node=1 time=2000
 
-Jobs run on this machine, `--at-once` of them at a time, or with `--slurm` on a cluster. Each leaves a run folder
-`<garment>_<seed>`; the sweep leaves `sweep.json` and prints a table. Run it again to go on: jobs that were stopped, or
-requeued by the cluster, resume from their checkpoints, and finished ones are not done again.
+Jobs run on this machine, `--at-once` of them at a time or one on each of `--gpus`, or with `--slurm` on a cluster. Each
+leaves a run folder `<garment>_<seed>`; the sweep leaves `sweep.json` and prints a table. Run it again to go on: jobs that
+were stopped, or requeued by the cluster, resume from their checkpoints, and finished ones are not done again.
 """
 
 import argparse
 import json
+import queue
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import submitit
 
-from clothjax import configuration
+from clothjax import checkpoint, configuration
 from clothjax.config import Config
 from experiments import evaluate, train
 from experiments.session import fail_clearly, progress, setup
@@ -31,11 +32,21 @@ class Job(submitit.helpers.Checkpointable):
     def __call__(self, arguments: list[str], directory: str) -> dict:
         setup()
         run = Path(directory)
-        train.main([*arguments, "--directory", directory])
         report = run / "evaluation.json"
-        if not report.exists():
-            report.write_text(json.dumps(evaluate.evaluate(run), indent=1) + "\n")
+        if report.exists():
+            kept = checkpoint.latest(run / "stage2" / "checkpoints").config
+            if kept != json.loads(json.dumps(configuration.to_dict(_configured(arguments, directory)))):
+                raise ValueError(f"{run} was trained with other settings: give another --directory, or remove it")
+        else:
+            train.main([*arguments, "--directory", directory])
+            partial = report.with_suffix(".partial")
+            partial.write_text(json.dumps(evaluate.evaluate(run), indent=1) + "\n")
+            partial.replace(report)
         return json.loads(report.read_text())["evaluation"]
+
+
+def _configured(arguments: list[str], directory: str) -> Config:
+    return configuration.cli(Config, [*arguments, "--directory", directory])
 
 
 def main(argv: list[str]) -> None:
@@ -45,34 +56,23 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--directory", type=Path, default=Path("runs/sweep"))
     parser.add_argument("--at-once", type=int, default=1, help="jobs on this machine at a time")
+    parser.add_argument("--gpus", nargs="+", type=int, default=None, help="of this machine, each for a job at a time")
     parser.add_argument(
         "--slurm", nargs="*", default=None, metavar="NAME=VALUE", help="a cluster, and sbatch's options"
     )
     chosen, settings = parser.parse_known_args(argv)
-    config = configuration.cli(Config, [chosen.config, *settings])  # a mistake shows before anything is submitted
     jobs = {}
-    for garment in chosen.garments or [config.garment]:
+    for garment in chosen.garments or [configuration.cli(Config, [chosen.config, *settings]).garment]:
         for seed in chosen.seeds:
             name = f"{Path(garment).stem.split('.')[0]}_{seed}"
+            if name in jobs:
+                raise ValueError(f"two jobs would be called {name}: give every seed once, and garments different names")
             arguments = [chosen.config, *settings, "--garment", garment]
             arguments += ["--stage1.seed", str(seed), "--stage2.seed", str(seed)]
             jobs[name] = (arguments, str(chosen.directory / name))
+            _configured(*jobs[name])  # a mistake shows before anything is submitted
     chosen.directory.mkdir(parents=True, exist_ok=True)
-    executor = _executor(chosen)
-    finished, failed = {}, {}
-
-    def run(job: tuple) -> dict:
-        return executor.submit(Job(), *job).result()
-
-    at_once = chosen.at_once if chosen.slurm is None else len(jobs)
-    with ThreadPoolExecutor(at_once) as pool, progress("jobs", len(jobs)) as report:
-        waiting = {pool.submit(run, job): name for name, job in jobs.items()}
-        for done, future in enumerate(as_completed(waiting), 1):
-            try:
-                finished[waiting[future]] = future.result()
-            except submitit.core.utils.UncompletedJobError as error:
-                failed[waiting[future]] = str(error).strip().splitlines()[-1]
-            report(done)
+    finished, failed = _run(jobs, chosen)
     summary = {name: finished[name] for name in jobs if name in finished}
     (chosen.directory / "sweep.json").write_text(json.dumps(summary, indent=1) + "\n")
     print(table(summary))
@@ -83,17 +83,49 @@ def main(argv: list[str]) -> None:
         raise ValueError(f"{len(failed)} of {len(jobs)} jobs failed ({reasons}); their logs are in {logs}")
 
 
-def _executor(chosen: argparse.Namespace) -> submitit.Executor:
+def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, dict], dict[str, str]]:
+    """What every job returned, and why the others did not."""
+    finished, failed = {}, {}
+    slots = queue.SimpleQueue()  # places for a job: the GPU it has there, if any
+    places = [None] * len(jobs) if chosen.slurm is not None else chosen.gpus or [None] * chosen.at_once
+    for gpu in places:
+        slots.put(gpu)
+
+    def run(job: tuple) -> dict:
+        gpu = slots.get()
+        try:
+            return _executor(chosen, gpu).submit(Job(), *job).result()
+        finally:
+            slots.put(gpu)
+
+    with ThreadPoolExecutor(len(places)) as pool, progress("jobs", len(jobs)) as report:
+        waiting = {pool.submit(run, job): name for name, job in jobs.items()}
+        try:
+            for done, future in enumerate(as_completed(waiting), 1):
+                try:
+                    finished[waiting[future]] = future.result()
+                except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedSubmissionError) as error:
+                    failed[waiting[future]] = str(error).strip().splitlines()[-1]
+                report(done)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+    return finished, failed
+
+
+def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
     if chosen.slurm is None:
         executor = submitit.LocalExecutor(chosen.directory / "logs")
-        executor.update_parameters(timeout_min=7 * 24 * 60)
+        one = {} if gpu is None else {"gpus_per_node": 1, "visible_gpus": (gpu,)}
+        executor.update_parameters(timeout_min=7 * 24 * 60, **one)
         return executor
     wrong = [option for option in chosen.slurm if "=" not in option]
     if wrong:
         raise ValueError(f"--slurm takes NAME=VALUE, such as partition=gpu; got {wrong[0]!r}")
+    options = {k: int(v) if v.isdecimal() else v for k, v in (option.split("=", 1) for option in chosen.slurm)}
+    if options.get("nodes", 1) != 1 or options.get("ntasks_per_node", 1) != 1:
+        raise ValueError("a job of a sweep is one process: leave nodes and ntasks_per_node out of --slurm")
     executor = submitit.SlurmExecutor(chosen.directory / "logs")
-    options = dict(option.split("=", 1) for option in chosen.slurm)
-    executor.update_parameters(**{k: int(v) if v.isdecimal() else v for k, v in options.items()})
+    executor.update_parameters(**options)
     return executor
 
 

@@ -7,7 +7,8 @@
 It leaves `stage1/` and `stage2/` in the run's folder, each with checkpoints, metrics.jsonl and training.json.
 
 With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
-Open MPI or Kubernetes job train together; elsewhere each is told `--processes ADDRESS:PORT,COUNT,INDEX`.
+Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere each is told
+`--processes ADDRESS:PORT,COUNT,INDEX`. All of them need the run's folder.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from jax.sharding import Mesh
 from clothjax import checkpoint, configuration, devices, experiment, fit, latent_predictor, stage1, stage2
 from clothjax.config import Config
 from clothjax.features import Statistics
-from experiments.session import fail_clearly, progress, setup
+from experiments.session import fail_clearly, progress, say, setup
 
 STEPS_PER_CALL = 20
 
@@ -32,11 +33,10 @@ def main(argv: list[str]) -> None:
     where, argv = parser.parse_known_args(argv)
     config = configuration.cli(Config, argv)
     devices.connect(where.processes)
-    several = jax.process_count() > 1
-    chosen = devices.choose(where.devices or ("auto" if several else "1"), config.stage1.batch, config.stage2.batch)
     directory = run_directory(config, argv)
     with devices.together(directory):
-        train(config, directory, chosen)
+        wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
+        train(config, directory, devices.choose(wanted, config.stage1.batch, config.stage2.batch))
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
@@ -44,21 +44,23 @@ def run_directory(config: Config, argv: list[str]) -> Path:
     return Path(config.directory or Path("runs") / Path(argv[0]).stem)
 
 
-def train(config: Config, directory: Path, among: Mesh | None = None) -> dict[str, float]:
+def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
     """Both stages; returns the seconds each took, with `compile_seconds` and `teacher_seconds` apart."""
-    if among is not None:
-        print(f"{among.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
+    if device_mesh is not None:
+        say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     whole = experiment.assemble(config)
     reel, bad = experiment.training_clips(whole)
+    for name in config.evaluation.motions:
+        experiment.motion(whole, name)  # a wrong one shows now, not after hours
     for name, count in bad.items():
         if count:
-            print(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
+            say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
     kept = configuration.to_dict(config)
 
-    print(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
+    say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     first = fit.fit(
-        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, among),
-        devices.copied(stage1.init(whole.scene, reel, config), among),
+        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, device_mesh),
+        devices.replicate(stage1.init(whole.scene, reel, config), device_mesh),
         steps=config.stage1.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage1",
@@ -69,12 +71,12 @@ def train(config: Config, directory: Path, among: Mesh | None = None) -> dict[st
     model = {"params": first.state.average, "statistics": first.state.statistics}
     joints = latent_predictor.kept_joints(whole.names, config.stage2)
 
-    print(f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi")
+    say(f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi")
     with progress("rolling out the teacher", config.stage2.sequences) as report:
-        teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, among)
+        teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
     second = fit.fit(
-        stage2.make_update(teacher, config, STEPS_PER_CALL, among),
-        devices.copied(stage2.init(teacher, jax.device_get(first.state.average["garment"]), config), among),
+        stage2.make_update(teacher, config, STEPS_PER_CALL, device_mesh),
+        devices.replicate(stage2.init(teacher, jax.device_get(first.state.average["garment"]), config), device_mesh),
         steps=config.stage2.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage2",

@@ -88,7 +88,7 @@ def _standing(whole: Experiment):
 
 
 def measure(config: Config, rounds: int) -> dict:
-    """Flops, bytes and seconds of a training step in each scene, and their ratio to the full one's."""
+    """Flops, bytes and seconds of a training step in each scene, compiled without loops, and ratios to the full one."""
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
     whole = experiment.assemble(config)
     programs = {}

@@ -57,7 +57,10 @@ def cost(one: Program) -> dict[str, float]:
 
 @contextlib.contextmanager
 def unrolled() -> Iterator[None]:
-    """Within it, scans are compiled without loops, so that `cost` counts all of them."""
+    """Within it, scans are compiled without loops, so that `cost` counts all of them.
+
+    Loops that end when their work is done, as those of the searches for contact, still count once.
+    """
     with mock.patch.object(jax.lax, "scan", partial(jax.lax.scan, unroll=True)):
         yield
 
