@@ -5,8 +5,8 @@
     python -m experiments.sweep configs/paper_tshirt.yaml --seeds 0 1 2 --slurm partition=gpu gpus_per_node=1 time=2000
 
 Jobs run on this machine, `--at-once` of them at a time or one on each of `--gpus`, or with `--slurm` on a cluster. Each
-leaves a run folder `<garment>_<seed>`; the sweep leaves `sweep.json` and prints a table. Run it again to go on: jobs that
-were stopped, or requeued by the cluster, resume from their checkpoints, and finished ones are not done again.
+leaves a run folder `<garment>_<seed>`; the sweep leaves `sweep.json` and prints a table. Run it again to go on: jobs
+that were stopped, or requeued by the cluster, resume from their checkpoints; finished ones are not done again.
 """
 
 import argparse

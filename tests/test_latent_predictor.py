@@ -36,6 +36,20 @@ def test_materials_are_scaled_to_zero_and_one_over_their_ranges():
     np.testing.assert_allclose(latent_predictor.constant_inputs(jnp.zeros(1), middle, config)[2], 0.5, atol=1e-4)
 
 
+def test_one_material_for_all_is_no_input_and_betas_are_still_bounded():
+    config = dataclasses.replace(Config(), material=MaterialConfig(sample=False))
+    material = Material(*(jnp.float32(x) for x in (0.2, 2e4, 4e4, 1e-5)))
+    betas = jnp.array([-1.5, 0.3, 1.9])
+    constants = latent_predictor.constant_inputs(betas, material, config.material)
+    np.testing.assert_array_equal(constants, betas)
+    inside, known = latent_predictor.bounded_constants(constants, config)
+    np.testing.assert_array_equal(inside, betas)
+    assert known
+    inside, known = latent_predictor.bounded_constants(2 * betas, config)
+    np.testing.assert_allclose(inside, [-2.0, 0.6, 2.0], rtol=1e-6)
+    assert not known
+
+
 def test_velocity_is_in_metres_a_second_and_in_the_heading_frame():
     parents, joints = np.array([-1, 0]), jnp.array([[0.0, 1.0, 0.0], [0.0, 1.5, 0.0]])
     angle = np.pi / 2  # facing +X

@@ -9,10 +9,12 @@ import pytest
 from toy import small
 
 from clothjax import character as characters
-from clothjax import clips, experiment, losses, rollout, scene, simulation, stage1, storage
+from clothjax import clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
 from clothjax.config import Config, Ramp
-from clothjax.types import Garment, Motion
+from clothjax.export.onnx import check_onnx, to_onnx
+from clothjax.types import Garment, Motion, Pose
 from data_prep import garment as garments
+from experiments import evaluate, render, train
 from experiments.benchmarks import scenes
 from experiments.benchmarks.timing import cost, program
 
@@ -227,3 +229,27 @@ def test_the_basis_is_the_dense_solvers(whole):
     np.testing.assert_allclose(energy, np.eye(count // 3), atol=1e-4)  # each costs 1 J, and none helps another
     quotients = np.einsum("kv,vw,kw->k", basis, matrix, basis) / np.einsum("kv,v,kv->k", basis, mass, basis)
     np.testing.assert_allclose(quotients, values, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_flag_goes_all_the_way(tmp_path):
+    """No body and one material: trained, measured, drawn, exported and run."""
+    config = dataclasses.replace(small(), motions=("walk_0",), directory=str(tmp_path))
+    config = dataclasses.replace(
+        config,
+        garment="skirt_1000",
+        physics=dataclasses.replace(config.physics, body="none", without=("friction",)),
+        material=dataclasses.replace(config.material, sample=False),
+    )
+    train.train(config, tmp_path)
+    report = evaluate.evaluate(tmp_path)["evaluation"]
+    assert report["psi"]["finite"] and "penetration_percent" not in report["psi"]
+    render.main([str(tmp_path), "--motion", "walk_3", "--out", str(tmp_path / "flag.webp"), "--frames", "3"])
+    render.main([str(tmp_path), "--motion", "walk_3", "--out", str(tmp_path / "flag.glb"), "--frames", "3"])
+    model = inference.load(tmp_path)
+    clip = storage.load_motion("walk_3", experiment.assemble(config).names)
+    clip = Motion(clip.rotations[:20], clip.translation[:20].astype(np.float32), clip.fps)
+    vertices, _ = inference.animate(model, clip)
+    assert np.isfinite(vertices).all()
+    onnx = to_onnx(model, tmp_path / "flag.onnx", Pose(clip.rotations[0], clip.translation[0]))
+    assert check_onnx(onnx, model, clip) < 1e-4
