@@ -74,7 +74,9 @@ def test_a_term_of_no_weight_is_not_computed():
     names = [field.name for field in dataclasses.fields(LossConfig) if field.name != "scale"]
     terms = dict.fromkeys(names, jnp.float32(1.0)) | {"friction": jnp.float32(jnp.nan)}
     config = LossConfig(friction=Ramp(0.0), inertia=Ramp(3.0, 5.0, 0, 100), scale=1.0)
-    assert losses.weighted(terms, config, jnp.int32(50)) == pytest.approx(6 + 4.0)
+    there = losses.present(terms, config)
+    assert set(there) == set(names) - {"friction"}
+    assert losses.weighted(there, config, jnp.int32(50)) == pytest.approx(6 + 4.0)
     assert losses.weighted(terms, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
 
 

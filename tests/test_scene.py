@@ -10,7 +10,6 @@ from toy import small
 
 from clothjax import character as characters
 from clothjax import clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
-from clothjax.config import Config, Ramp
 from clothjax.export.onnx import check_onnx, to_onnx
 from clothjax.types import Garment, Motion, Pose
 from data_prep import garment as garments
@@ -90,15 +89,6 @@ def test_the_energies_of_a_scene(whole, pose, name, missing):
     assert set(found) == {
         "stretching", "bending", "gravity", "inertia", "friction", "collision", "edge_collision"
     } - missing  # fmt: skip
-
-
-def test_a_term_without_weight_is_not_in_the_loss():
-    terms = {"stretching": jnp.float32(1.0), "bending": jnp.float32(2.0)}
-    config = dataclasses.replace(Config().loss, bending=Ramp(0.0), scale=1.0)
-    assert losses.present(terms, config) == {"stretching": terms["stretching"]}
-    assert losses.weighted(losses.present(terms, config), config, jnp.int32(0)) == 1.0
-    ramp = dataclasses.replace(config, bending=Ramp(0.0, 1.0, 0, 10))
-    assert set(losses.present(terms, ramp)) == set(terms)
 
 
 def test_elements_among_pinned_vertices_are_left_out_and_not_missed(whole, pose):
