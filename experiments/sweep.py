@@ -12,6 +12,7 @@ that were stopped, or requeued by the cluster, resume from their checkpoints; fi
 import argparse
 import json
 import queue
+import re
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -105,11 +106,18 @@ def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, 
                 try:
                     finished[waiting[future]] = future.result()
                 except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedSubmissionError) as error:
-                    failed[waiting[future]] = str(error).strip().splitlines()[-1]
+                    failed[waiting[future]] = _reason(error)
                 report(done)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
     return finished, failed
+
+
+def _reason(error: Exception) -> str:
+    """The line of a job's traceback that says what went wrong; else the last line there is."""
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    said = [line for line in lines if re.match(r"[\w.]+(Error|Exit|Interrupt)\b", line)]
+    return (said or lines or [type(error).__name__])[-1]
 
 
 def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
