@@ -77,7 +77,7 @@ def test_a_term_of_no_weight_is_not_computed():
     there = losses.present(terms, config)
     assert set(there) == set(names) - {"friction"}
     assert losses.weighted(there, config, jnp.int32(50)) == pytest.approx(6 + 4.0)
-    assert losses.weighted(terms, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
+    assert losses.weighted(there, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
 
 
 @pytest.fixture
