@@ -52,6 +52,12 @@ def _is_one_of_several() -> bool:
     return max(slurm, mpi) > 1 or {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= os.environ.keys()
 
 
+def say(text: str) -> None:
+    """Prints a line, of several processes only in the first."""
+    if jax.process_index() == 0:
+        print(text, flush=True)
+
+
 @contextlib.contextmanager
 def together(directory: Path) -> Iterator[None]:
     """Within it, of several processes none outlives an error in one: they cannot go on without each other.

@@ -19,7 +19,7 @@ import optax
 from jax.experimental import multihost_utils
 from tqdm import tqdm
 
-from clothjax import checkpoint, run_folder
+from clothjax import checkpoint, devices, run_folder
 
 State = TypeVar("State")
 Metrics = dict[str, Any]
@@ -94,8 +94,6 @@ def fit(
     with lock, _interrupts() as interrupted, _advice(checkpoints):
         state = _resume(checkpoints, state, config, may_differ)
         first = _step(state)
-        if first != _anywhere(first) or first != -_anywhere(-first):
-            raise ValueError(f"{directory} must be on a file system that all processes of a training share")
         seconds, compile_seconds = run_folder.read_seconds(directory) if first else (0.0, 0.0)
         rows = run_folder.metrics_file(directory, first) if leader else contextlib.nullcontext(lambda row: None)
         saved = time.monotonic()
@@ -119,7 +117,7 @@ def fit(
                     break
     if stop:
         name = signal.Signals(stop).name
-        _say(f"{name}: saved step {call.step} of {steps} in {directory}; run the same command again to go on")
+        devices.say(f"{name}: saved step {call.step} of {steps} in {directory}; run the same command again to go on")
         raise SystemExit(128 + stop)
     return Fitted(state, seconds, compile_seconds)
 
@@ -219,6 +217,9 @@ def _figures(metrics: Metrics) -> dict[str, float]:
 
 def _resume(checkpoints: Path, state: Any, config: dict, may_differ: tuple[str, ...]) -> Any:
     """The state of the newest undamaged checkpoint of this run; `state` where there is none yet."""
+    newest = max(checkpoint.steps(checkpoints), default=0)
+    if newest != _anywhere(newest) or newest != -_anywhere(-newest):
+        raise ValueError(f"{checkpoints.parent} must be on a file system that all processes of a training share")
     if not checkpoint.steps(checkpoints):
         return state
     stored, here = _flat(checkpoint.latest(checkpoints).config), _flat(config)
@@ -236,7 +237,7 @@ def _resume(checkpoints: Path, state: Any, config: dict, may_differ: tuple[str, 
     state, found = checkpoint.restore(checkpoints, state)
     if jax.process_index() == 0:
         checkpoint.set_aside(checkpoints, found.step)
-    _say(f"going on from step {found.step} in {checkpoints.parent}")
+    devices.say(f"going on from step {found.step} in {checkpoints.parent}")
     return state
 
 
@@ -303,28 +304,23 @@ def _progress(first: int, steps: int, every: float) -> Iterator[Callable[[_Call,
         yield lambda call, loss: None
         return
     if first < steps:
-        _say(f"training from step {first} to {steps}; compiling first")
+        devices.say(f"training from step {first} to {steps}; compiling first")
 
     def report(call: _Call, loss: float) -> None:
         nonlocal seconds, spoken
         seconds += call.seconds
         if call.compile_seconds:
-            (bar.write if terminal else _say)(f"compiled in {call.compile_seconds:.1f} s")
+            (bar.write if terminal else devices.say)(f"compiled in {call.compile_seconds:.1f} s")
         bar.set_postfix(loss=f"{loss:.4g}", refresh=False)
         bar.update(call.step - bar.n)
         if not terminal and (call.step == steps or time.monotonic() - spoken >= every):
             spoken = time.monotonic()
             rate = (call.step - first) / max(seconds, 1e-9)
             left = tqdm.format_interval((steps - call.step) / rate)
-            _say(f"step {call.step}/{steps}  loss {loss:.4g}  {rate:.4g} steps/s  {left} left")
+            devices.say(f"step {call.step}/{steps}  loss {loss:.4g}  {rate:.4g} steps/s  {left} left")
 
     with tqdm(total=steps, initial=first, unit="step", file=sys.stdout, disable=not terminal) as bar:
         yield report
-
-
-def _say(text: str) -> None:
-    if jax.process_index() == 0:
-        print(text, flush=True)
 
 
 def _anywhere(flag: int) -> int:

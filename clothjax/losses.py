@@ -38,44 +38,36 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
     moved = new - step.position
     contact = step.contact
     terms = {
-        "stretching": lambda: physics.stretching(
+        "stretching": physics.stretching(
             new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
         ),
-        "bending": lambda: physics.bending(
+        "bending": physics.bending(
             new[mesh.hinges], step.rest.hinge_area, step.rest.hinge_angle, step.material.bending
         ),
         # the height gained in the step: the same force as the height, without its large constant
-        "gravity": lambda: physics.gravity(moved[:, 1], step.mass),
-        "inertia": lambda: physics.inertia(moved - step.velocity, step.mass, step.timestep),
+        "gravity": physics.gravity(moved[:, 1], step.mass),
+        "inertia": physics.inertia(moved - step.velocity, step.mass, step.timestep),
     }
+    if contact is not None:
+        gap = contacts.distance(new, contact.point_next, contact.normal_next)
+        terms["collision"] = config.collision_stiffness * physics.collision(gap, config.collision_offset)
     if step.touching is not None:
-        terms["friction"] = lambda: physics.friction(
+        normal = contact.normal + contact.normal_next
+        length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
+        terms["friction"] = physics.friction(
             moved - (contact.point_next - contact.point),
-            _mean_direction(contact.normal, contact.normal_next),
+            normal / length,
             step.mass,
             step.touching,
             config.friction_coefficient,
             config.friction_smoothing,
         )
-    if contact is not None:
-        terms["collision"] = lambda: (
-            config.collision_stiffness
-            * physics.collision(
-                contacts.distance(new, contact.point_next, contact.normal_next), config.collision_offset
-            )
-        )
-    terms = {name: term() for name, term in terms.items() if name not in config.without}
     if step.edge_contact is not None:
         terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config)
     if step.self_contact is not None:
         points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
         terms["self_collision"] = self_collision(points, step.self_contact, config)
-    return terms
-
-
-def _mean_direction(one: Array, other: Array) -> Array:
-    total = one + other
-    return total / jnp.sqrt(jnp.maximum(jnp.sum(total * total, axis=-1, keepdims=True), 1e-12))
+    return {name: values for name, values in terms.items() if name not in config.without}
 
 
 def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig) -> Array:

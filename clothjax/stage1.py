@@ -12,12 +12,14 @@ from jax.sharding import Mesh
 from clothjax import character as characters
 from clothjax import clips as motion
 from clothjax import compact_latent, devices, fit, losses, rollout
-from clothjax.character import Character
+from clothjax import features as feature
+from clothjax.character import Character, Window
 from clothjax.clips import Clips
 from clothjax.config import Config, Range
 from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.fit import Weights
+from clothjax.losses import TimeStep
 from clothjax.scene import Scene, laplacian_basis
 from clothjax.types import Array, ClothState, Material
 
@@ -119,7 +121,7 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
     stiffness = physical_stiffness(config)
     basis = laplacian_basis(scene, config.model.blendshapes, stiffness, config.material.density, 1.0 / config.fps)
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
-    example = example_features(scene, clips, config)
+    example = jax.eval_shape(lambda k: first_step(scene, begin(k, scene, clips, config), clips, config), key).seen
     params = jax.jit(lambda k: compact_latent.init(k, scene, example, 0.1 * basis, config.model))(model_key)
     if config.model.latent_update == "descent":
         params["descent"]["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(
@@ -143,7 +145,7 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
         scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
     )
     rest = character.template
-    step = losses.TimeStep(
+    step = TimeStep(
         position=rest,
         velocity=jnp.zeros_like(rest),
         mass=character.mass,
@@ -166,22 +168,26 @@ def physical_stiffness(config: Config) -> float:
     return 0.25 * 4.7e-4 * (2 * config.material.mu + config.material.lam)
 
 
-def example_features(scene: Scene, clips: Clips, config: Config) -> Features:
-    """Shapes of the inputs of Phi in this scene, without computing any."""
-    clips = jax.tree.map(jnp.asarray, clips)
+class FirstStep(NamedTuple):
+    """A step of a new simulation, and what Phi sees of it."""
 
-    def features(key):
-        simulation = begin(key, scene, clips, config)
-        character = wearer(scene, simulation.betas, simulation.material, config)
-        window = characters.window(scene, character, motion.poses(clips, simulation.frame))
-        step = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
-        return compact_latent.feature.features(
-            scene, character, simulation.cloth, window, step.contact, jnp.float32(1.0 / config.fps),
-            simulation.cloth.position, simulation.cloth.position,
-            config.model, config.material,
-        )  # fmt: skip
+    character: Character
+    window: Window
+    step: TimeStep
+    seen: Features
 
-    return jax.eval_shape(features, jax.random.key(0))
+
+def first_step(scene: Scene, simulation: Simulation, clips: Clips, config: Config) -> FirstStep:
+    """The first step of a simulation, with the garment held where it is for a guess."""
+    character = wearer(scene, simulation.betas, simulation.material, config)
+    window = characters.window(scene, character, motion.poses(clips, simulation.frame))
+    step = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
+    held = simulation.cloth.position
+    seen = feature.features(
+        scene, character, simulation.cloth, window, step.contact, step.timestep, held, 0.0 * held,
+        config.model, config.material,
+    )  # fmt: skip
+    return FirstStep(character, window, step, seen)
 
 
 def rollout_length(step: int, config: Config) -> int:

@@ -39,7 +39,7 @@ def main(argv: list[str]) -> None:
     path = arguments.json
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(report, indent=1) + "\n")
-    scaling.plot(report["stage1"], path.with_suffix(".png"))
+    scaling.plot(report[arguments.part], path.with_suffix(".png"))
     print(json.dumps(report, indent=1))
     print(f"written to {path} and {path.with_suffix('.png')}")
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import jax
 from tqdm import tqdm
 
+from clothjax import devices
+
 
 def setup() -> None:
     """Keeps compiled programs between runs, in `.jax_cache` or where JAX_COMPILATION_CACHE_DIR says."""
@@ -29,12 +31,6 @@ def fail_clearly() -> Iterator[None]:
         raise SystemExit(1) from None
 
 
-def say(text: str) -> None:
-    """Prints a line, of several processes only in the first."""
-    if jax.process_index() == 0:
-        print(text, flush=True)
-
-
 @contextlib.contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function to call with the amount done: a bar on a terminal, a line every ten seconds elsewhere."""
@@ -47,6 +43,6 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
             bar.update(done - bar.n)
             if not terminal and (time.monotonic() - last > 10 or done == total):
                 last = time.monotonic()
-                say(f"{what}: {done}/{total}")
+                devices.say(f"{what}: {done}/{total}")
 
         yield report

@@ -21,7 +21,7 @@ from jax.sharding import Mesh
 from clothjax import checkpoint, configuration, devices, experiment, fit, latent_predictor, stage1, stage2
 from clothjax.config import Config
 from clothjax.features import Statistics
-from experiments.session import fail_clearly, progress, say, setup
+from experiments.session import fail_clearly, progress, setup
 
 STEPS_PER_CALL = 20
 
@@ -47,17 +47,17 @@ def run_directory(config: Config, argv: list[str]) -> Path:
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
     """Both stages; returns the seconds each took, with `compile_seconds` and `teacher_seconds` apart."""
     if device_mesh is not None:
-        say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
+        devices.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     whole = experiment.assemble(config)
     reel, bad = experiment.training_clips(whole)
     for name in config.evaluation.motions:
         experiment.motion(whole, name)  # a wrong one shows now, not after hours
     for name, count in bad.items():
         if count:
-            say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
+            devices.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
     kept = configuration.to_dict(config)
 
-    say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
+    devices.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     first = fit.fit(
         stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, device_mesh),
         devices.replicate(stage1.init(whole.scene, reel, config), device_mesh),
@@ -71,7 +71,9 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     model = {"params": first.state.average, "statistics": first.state.statistics}
     joints = latent_predictor.kept_joints(whole.names, config.stage2)
 
-    say(f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi")
+    devices.say(
+        f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi"
+    )
     with progress("rolling out the teacher", config.stage2.sequences) as report:
         teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
     second = fit.fit(

@@ -12,7 +12,7 @@ from toy import small
 from clothjax import configuration
 from clothjax.config import Config
 from experiments import benchmark
-from experiments.benchmarks import stage1, timing
+from experiments.benchmarks import scaling, scenes, stage1, timing
 
 
 def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
@@ -22,6 +22,8 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.setattr(benchmark.configuration, "cli", lambda *_: config)
     monkeypatch.setattr(stage1, "CONVOLUTION", (3, 4))
+    monkeypatch.setattr(scaling, "SMALL", (300, 400))
+    monkeypatch.setattr(scenes, "SCENES", {name: scenes.SCENES[name] for name in ("full", "no_bending")})
     benchmark.main(["--quick", "--json", str(tmp_path / "b.json")])
     report = json.loads((tmp_path / "b.json").read_text())
     assert json.dumps(report, indent=1) in capsys.readouterr().out
@@ -37,6 +39,10 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     assert ours["flops"] < explicit["flops"] and ours["temporary_mib"] < explicit["temporary_mib"]
     ratio = figures["processor"]["textbook"]["seconds"] / figures["processor"]["ours"]["seconds"]
     assert figures["processor_speedup"] == pytest.approx(ratio)
+    assert 0 < figures["contact_share"] < 1
+    assert figures["compile_seconds_cached"] < figures["compile_seconds_cold"]
+    assert figures["scenes"]["no_bending"]["flops_ratio"] < figures["scenes"]["full"]["flops_ratio"] == 1
+    assert (tmp_path / "b.png").exists()
 
 
 def test_the_configurations_measured_are_valid():

@@ -8,19 +8,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 
-from clothjax import character as characters
-from clothjax import clips as motion
-from clothjax import compact_latent, experiment, fit, graph_sampling, losses, mesh_convolution, rollout, solver
-from clothjax import features as feature
+from clothjax import compact_latent, experiment, fit, graph_sampling, losses, mesh_convolution, solver
 from clothjax import stage1 as training
-from clothjax.character import Character, Window
 from clothjax.clips import Clips
 from clothjax.config import Config
 from clothjax.experiment import Experiment
-from clothjax.features import Features
-from clothjax.losses import TimeStep
-from clothjax.types import ClothState
 from experiments.benchmarks import textbook, timing
 from experiments.benchmarks.timing import against_peaks, cost, interleaved, program, temporary_bytes
 from experiments.session import progress
@@ -31,15 +25,11 @@ BATCH = 4
 
 
 class Moment(NamedTuple):
-    """The first frame of a simulation, and all that a step of Phi there starts from."""
+    """A training that begins: its state and clips, and the first step of its first simulation."""
 
     state: training.TrainingState
     clips: Clips
-    character: Character
-    cloth: ClothState
-    window: Window
-    step: TimeStep
-    seen: Features
+    first: training.FirstStep
 
 
 def measure(config: Config, rounds: int) -> dict:
@@ -69,7 +59,7 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
     names = ("type_embedding", "level_embedding", "encoder", "processor")
     params = {name: state.params[name] for name in names}
     forms = {"ours": compact_latent.pass_messages, "textbook": textbook.process}
-    arguments = (params, state.statistics, moment.seen)
+    arguments = (params, state.statistics, moment.first.seen)
     kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
     programs = {
         "ours": program(loss(forms["ours"], recomputed), *arguments),
@@ -147,12 +137,12 @@ def compilation(whole: Experiment) -> dict:
     before = jax.config.jax_compilation_cache_dir
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_compilation_cache_dir", folder)
-        jax.experimental.compilation_cache.compilation_cache.reset_cache()
+        compilation_cache.reset_cache()
         try:
             return {"compile_seconds_cold": once(), "compile_seconds_cached": once()}
         finally:
             jax.config.update("jax_compilation_cache_dir", before)
-            jax.experimental.compilation_cache.compilation_cache.reset_cache()
+            compilation_cache.reset_cache()
 
 
 def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
@@ -176,7 +166,7 @@ def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
     return {
         "step_seconds": seconds["step"],
         "step_temporary_mib": temporary_bytes(programs["step"]) / 2**20,
-        "contact_share": seconds["contact"] / seconds["step"],
+        "contact_share": seconds["body and contact"] / seconds["step"],
         "batch4_per_window_ratio": seconds["batch"] / BATCH / seconds["step"],
         "peaks": best,
         "pieces": {
@@ -194,27 +184,12 @@ def _pieces(whole: Experiment, moment: Moment) -> dict:
     """Functions, with their arguments, that together are most of a training step."""
     config, scene = whole.config, whole.scene
     params, statistics = moment.state.params, moment.state.statistics
-    character, cloth, window, seen = moment.character, moment.cloth, moment.window, moment.seen
+    simulation = jax.tree.map(lambda x: x[0], moment.state.pool)
+    cloth, (character, window, step, seen) = simulation.cloth, moment.first
 
-    def contact(cloth, window, character):
-        step = rollout.time_step(scene, character, cloth, window, 1.0 / config.fps, config)
-        held = cloth.position
-        found = feature.features(
-            scene,
-            character,
-            cloth,
-            window,
-            step.contact,
-            step.timestep,
-            held,
-            0.0 * held,
-            config.model,
-            config.material,
-        )
-        return step, found.world
-
-    def bodies(poses, character):
-        return characters.window(scene, character, poses)
+    def contact(simulation):
+        found = training.first_step(scene, simulation, moment.clips, config)
+        return found.step, found.seen.world
 
     def passing(params, seen):
         return jnp.mean(compact_latent.pass_messages(params, statistics, scene, seen, config.model) ** 2)
@@ -235,39 +210,22 @@ def _pieces(whole: Experiment, moment: Moment) -> dict:
 
     processed = jnp.zeros((len(cloth.position), config.model.width))
     weights = fit.Weights(moment.state.params, moment.state.average, moment.state.optimizer)
-    poses = motion.poses(moment.clips, moment.state.pool.frame[0])
     return {
-        "skinning the body": (bodies, poses, character),
-        "contact": (contact, cloth, window, character),
+        "body and contact": (contact, simulation),
         "encoder and processor": (
             *gradient(passing, "type_embedding", "level_embedding", "encoder", "processor"),
             seen,
         ),
         "mesh convolution": (*gradient(convolving, "convolution", "latent"), processed),
-        "decoder and physics": (*gradient(physics, "garment"), cloth.latent, moment.step),
+        "decoder and physics": (*gradient(physics, "garment"), cloth.latent, step),
         "optimiser": (descent, params, weights),
     }
 
 
 def first_moment(whole: Experiment) -> Moment:
-    """The first frame of the first simulation of a training."""
-    config, scene = whole.config, whole.scene
-    reel, _ = experiment.training_clips(whole)
-    clips = jax.tree.map(jnp.asarray, reel)
-    state = training.init(scene, clips, config)
+    """The first moment of a training."""
+    clips = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
+    state = training.init(whole.scene, clips, whole.config)
     simulation = jax.tree.map(lambda x: x[0], state.pool)
-
-    @jax.jit
-    def start(simulation):
-        character = training.wearer(scene, simulation.betas, simulation.material, config)
-        window = characters.window(scene, character, motion.poses(clips, simulation.frame))
-        step = rollout.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
-        held = simulation.cloth.position
-        seen = feature.features(
-            scene, character, simulation.cloth, window, step.contact, step.timestep, held, 0.0 * held,
-            config.model, config.material,
-        )  # fmt: skip
-        return character, window, step, seen
-
-    character, window, step, seen = start(simulation)
-    return Moment(state, clips, character, simulation.cloth, window, step, seen)
+    first = jax.jit(lambda one: training.first_step(whole.scene, one, clips, whole.config))(simulation)
+    return Moment(state, clips, first)
