@@ -1,5 +1,7 @@
 """Encoder MLPs and message-passing blocks on several edge sets (HOOD; Pfaff et al. 2021)."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -12,6 +14,7 @@ from clothjax.config import Stack
 from clothjax.types import Array, EdgeSet
 
 Params = dict
+CHUNK = 1024  # rows of an MLP at a time, where a CPU recomputes it: its layers then stay in the cache
 
 
 # --- multilayer perceptrons ---------------------------------------------------------------------------------------
@@ -54,6 +57,16 @@ def _mlp_tail(params: Params, first: Array) -> Array:
     if "norm" not in params:
         return x
     return _affine(jax.nn.standardize(x, epsilon=1e-5), params["norm"]["scale"], params["norm"]["bias"])
+
+
+def _mlp_tail_in_chunks(params: Params, first: Array) -> Array:
+    """`_mlp_tail`, some rows at a time, that keeps nothing but `first` for the backward pass."""
+    count, width = first.shape
+    chunks = -(-count // CHUNK)
+    rows = -(-count // chunks)
+    parts = jnp.pad(first, ((0, chunks * rows - count), (0, 0))).reshape(chunks, rows, width)
+    done = jax.lax.map(jax.checkpoint(partial(_mlp_tail, params), prevent_cse=False), parts)
+    return done.reshape(chunks * rows, -1)[:count]
 
 
 @jax.custom_vjp
@@ -133,12 +146,13 @@ def process(
         level: [V] the deepest coarse level of a vertex, plus one; 0 for none.
     """
     body, pairs = (None, {}) if world is None else (world.nodes, world.pairs)
+    tail = _mlp_tail_in_chunks if remat and jax.default_backend() == "cpu" else _mlp_tail
     for stack, stacked in zip(stacks, params):
         rows, among = _reached(stack, graph, level)
         slots, active = (None, None) if world is None else (world.slots[rows], world.active[rows])
 
         def block(carry, p, rows=rows, among=among, slots=slots, active=active):
-            return _block(p, *carry, rows, among, slots, active), None
+            return _block(p, *carry, rows, among, slots, active, tail), None
 
         if remat:
             block = jax.checkpoint(block, prevent_cse=False)
@@ -158,41 +172,45 @@ def _reached(stack: Stack, graph: dict[str, EdgeSet], level: np.ndarray) -> tupl
     return np.flatnonzero(reached), {name: EdgeSet(*(number[ends] for ends in graph[name])) for name in stack.edges}
 
 
-def _block(params, nodes, body, edges, pairs, rows, graph, slots, active):
-    """One residual block. First layers are applied before what they read is gathered or put side by side."""
+def _block(params, nodes, body, edges, pairs, rows, graph, slots, active, tail):
+    """One residual block. First layers are applied before what they read is gathered or put side by side.
+
+    Args:
+        tail: the other layers of an MLP, `_mlp_tail` in one of its forms.
+    """
     here, new_body = nodes[rows], body
     arrived, new_edges, new_pairs = {}, {}, {}
     for name, latent in edges.items():
         senders, receivers = graph[name]
-        message = _message(params[f"edge_{name}"], here, here, latent, receivers, senders)
+        message = _message(params[f"edge_{name}"], here, here, latent, receivers, senders, tail)
         arrived[name] = jraph.segment_sum(message, receivers, len(here), indices_are_sorted=True)
         new_edges[name] = latent + message
     if "to_garment" in pairs:
-        message = _message(params["edge_world"], here, body, pairs["to_garment"], None, slots)
+        message = _message(params["edge_world"], here, body, pairs["to_garment"], None, slots, tail)
         arrived["world"] = jnp.where(active[:, None], message, 0.0)
         new_pairs["to_garment"] = pairs["to_garment"] + arrived["world"]
     if "to_body" in pairs:
-        message = _message(params["edge_world"], body, here, pairs["to_body"], slots, None)
+        message = _message(params["edge_world"], body, here, pairs["to_body"], slots, None, tail)
         back = jnp.where(active[:, None], message, 0.0)
         new_pairs["to_body"] = pairs["to_body"] + back
         at_body = jraph.segment_sum(back, slots, len(body))
-        new_body = body + _node_update(params["node"], body, slice(None), at_body)
+        new_body = body + _node_update(params["node"], body, slice(None), at_body, tail)
     everything = jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1)
-    return nodes + _node_update(params["node"], nodes, rows, everything), new_body, new_edges, new_pairs
+    return nodes + _node_update(params["node"], nodes, rows, everything, tail), new_body, new_edges, new_pairs
 
 
-def _node_update(params: Params, nodes: Array, rows: Any, arrived: Array) -> Array:
+def _node_update(params: Params, nodes: Array, rows: Any, arrived: Array, tail: Callable) -> Array:
     """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
     kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
     own = nodes @ kernel[: nodes.shape[-1]] + bias[None]
-    return _mlp_tail(params, own.at[rows].add(arrived @ kernel[-arrived.shape[-1] :]))
+    return tail(params, own.at[rows].add(arrived @ kernel[-arrived.shape[-1] :]))
 
 
-def _message(params, targets, sources, latent, target_index, source_index):
+def _message(params, targets, sources, latent, target_index, source_index, tail):
     """MLP([target, source, edge]) with the node parts of its first layer multiplied before the gather."""
     width = latent.shape[-1]
     kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
     target, source = targets @ kernel[:width], sources @ kernel[width : 2 * width]
     target = target if target_index is None else target[target_index]
     source = source if source_index is None else source[source_index]
-    return _mlp_tail(params, target + source + latent @ kernel[2 * width :] + bias[None])
+    return tail(params, target + source + latent @ kernel[2 * width :] + bias[None])

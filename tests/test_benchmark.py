@@ -17,8 +17,11 @@ from experiments.benchmarks import scaling, scenes, stage1, timing
 
 def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     config = small()
-    config = dataclasses.replace(
-        config, motions=("walk_0",), model=dataclasses.replace(config.model, body_nodes="updated")
+    config = dataclasses.replace(  # what compiles soonest
+        config,
+        motions=("walk_0",),
+        model=dataclasses.replace(config.model, body_nodes="updated", latent_update="absolute"),
+        physics=dataclasses.replace(config.physics, contact_surface="centroids", edge_contact=False),
     )
     monkeypatch.setattr(benchmark.configuration, "cli", lambda *_: config)
     monkeypatch.setattr(stage1, "CONVOLUTION", (3, 4))

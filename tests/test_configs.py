@@ -10,9 +10,12 @@ from clothjax import configuration, experiment, stage1
 from clothjax.config import Config
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+ALIKE = ("pants", "dress")  # like the skirt: the same program on another mesh
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=[path.stem for path in CONFIGS])
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in ALIKE), id=p.stem) for p in CONFIGS]
+)
 def test_every_configuration_takes_two_steps(path):
     config = shrink(configuration.load(Config, path))
     config = dataclasses.replace(config, motions=("walk_0",))

@@ -146,6 +146,7 @@ for one, four in zip(teachers[0], teachers[1], strict=True):
 """
 
 
+@pytest.mark.slow
 def test_four_devices_take_the_step_of_one(config):
     """Parameters to 1e-6 after one update; after that Adam turns rounding into whole steps. Teachers likewise."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}

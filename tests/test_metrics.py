@@ -164,7 +164,7 @@ def test_pinned_vertices_follow_skinning():
     character = characters.dress(whole.scene, jnp.zeros(10), experiment.material(config), config.physics)
     poses = jax.tree.map(lambda x: x[:6], evaluate.windows(experiment.motion(whole, "walk_3")))
     model = {"params": state.params, "statistics": state.statistics}
-    _, states, _ = rollout.play(model, whole.scene, character, poses, config)
+    _, states, _ = jax.jit(lambda m, p: rollout.play(m, whole.scene, character, p, config))(model, poses)
     skinned = evaluate.skinned_trajectory(whole, character, poses)
     pinned = np.asarray(whole.garment.pinned)
     assert pinned.sum() > 10

@@ -108,10 +108,15 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     config, scene = whole.config, whole.scene
     state, one, character = _untrained(whole, reel)
     reel = jax.tree.map(jnp.asarray, reel)
-    _, (cloth, terms, _) = rollout.training_rollout(
-        state.params, state.statistics, scene, character, one.cloth, reel, one.frame, jnp.asarray(True),
-        state.step, 1, config,
-    )  # fmt: skip
+
+    @jax.jit
+    def one_update(state, cloth):
+        return rollout.training_rollout(
+            state.params, state.statistics, scene, character, cloth, reel, one.frame, jnp.asarray(True),
+            state.step, 1, config,
+        )  # fmt: skip
+
+    _, (cloth, terms, _) = one_update(state, one.cloth)
     window = characters.window(scene, character, clips.poses(reel, one.frame))
     skinned = characters.skinned(character, window.current)
     # an untrained network hardly moves the cloth: it stays where it was skinned and keeps the body's velocity
@@ -143,8 +148,6 @@ def test_gradients_go_through_as_many_frames_as_configured(toy):
     assert cut == pytest.approx(through, rel=1e-5)
     # the first frame moves the second a little: a thousandth here, hundreds of times what rounding does
     assert np.linalg.norm(long - short) > 1e-4 * np.linalg.norm(short)
-    _, longer = gradient(3)  # than the rollout
-    assert np.linalg.norm(longer - long) < 1e-5 * np.linalg.norm(long)
 
 
 def test_the_rollout_grows_with_the_curriculum():
