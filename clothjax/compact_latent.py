@@ -54,8 +54,7 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
     size = left * per_vertex
     params = {}
     if config.latent_update == "descent":
-        zero = jnp.zeros((size, size))
-        params["descent"] = {"inverse_hessian": zero, "correction": zero}
+        params["inverse_hessian"] = jnp.zeros((size, size))
     if channels is not None:
         # a change of the code starts small, a code starts at unit size
         params["latent"] = init_dense(keys[7], channels, per_vertex, gain=1e-4 if params else 1.0)
@@ -155,45 +154,57 @@ def convolve(params: Params, scene: Scene, processed: Array, config: ModelConfig
     return processed.reshape(-1)
 
 
-def newton_step(
-    descent: Params,
+def descend(
+    precondition: Callable[[Array], Array],
     latent: Array,
     garment: Callable[[Array], Array],
     potential: Callable[[Array], Array],
-    config: ModelConfig,
-) -> tuple[Array, Array, Array]:
-    """The garment [V, 3] m if held, the force [V, 3] N on it there, and nearly a Newton step [L] from it on Z.
+    steps: int,
+    bound: float,
+) -> Array:
+    """The code [L] after some conjugate-gradient steps (Polak-Ribiere) on the potential of its garment.
 
-    The Hessian of the potential in the space of codes hardly changes but for contact, so its inverse at rest gives
-    the direction. The length is that of Newton's method along it, by the curvature that the potential has now: cloth
+    The length of a step is that of Newton's method along it, by the curvature that the potential has there: cloth
     that rests on the body is stiffer than any at rest, and would be thrown off it.
+
+    Args:
+        precondition: an approximate inverse Hessian times a gradient [L].
+        garment: of a code, vertices [V, 3] m; potential: of these, J.
+        bound: length that no step exceeds.
     """
-    held, pullback = jax.vjp(garment, latent)
-    gradient, hessian = jax.linearize(jax.grad(potential), held)
-    direction = -jnp.matmul(pullback(gradient)[0], descent["inverse_hessian"], precision="highest")
-    _, moved = jax.jvp(garment, (latent,), (direction,))
-    slope, curvature = jnp.maximum(-jnp.sum(moved * gradient), 0.0), jnp.sum(moved * hessian(moved))
-    convex = curvature > 0
-    length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
-    push = length * direction
-    # deep collisions push thousands of times harder than the rest
-    push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / config.descent_bound**2)
-    return held, -gradient, jax.lax.stop_gradient(push)
+
+    def step(carry, _):
+        latent, direction, gradient, steepest = carry
+        held, pullback = jax.vjp(garment, latent)
+        force, hessian = jax.linearize(jax.grad(potential), held)
+        new = pullback(force)[0]
+        down = -precondition(new)
+        kept = jnp.sum(new * (steepest - down)) / jnp.maximum(-jnp.sum(gradient * steepest), 1e-12)
+        direction = down + jnp.maximum(kept, 0.0) * direction
+        direction = jnp.where(jnp.sum(new * direction) < 0, direction, down)
+        _, moved = jax.jvp(garment, (latent,), (direction,))
+        slope, curvature = jnp.maximum(-jnp.sum(moved * force), 0.0), jnp.sum(moved * hessian(moved))
+        convex = curvature > 0
+        length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
+        push = jnp.where(slope > 0, length, 0.0) * direction
+        # deep collisions push thousands of times harder than the rest
+        push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / bound**2)
+        return (latent + push, direction, new, down), None
+
+    zero = jnp.zeros_like(latent)
+    (latent, *_), _ = jax.lax.scan(step, (latent, zero, zero, zero), None, length=steps)
+    return latent
 
 
-def inverse_hessian(potential: Callable[[Array], Array], garment: Params, size: int, config: ModelConfig) -> Array:
-    """The inverse Hessian [L, L] in 1/J of a potential of canonical displacements [V, 3] m, over codes near zero."""
-    free = jnp.ones(garment["blendshapes"].shape[1])
-
-    def energy(latent):
-        return potential(garment_model.displacement(garment, latent, free, config))
+def inverse_hessian(energy: Callable[[Array], Array], size: int, damping: float) -> Array:
+    """The inverse Hessian [L, L] in 1/J of an energy of codes [L], near zero; `damping` J is added to the Hessian."""
 
     def column(direction):
         return jax.jvp(jax.grad(energy), (jnp.zeros(size),), (direction,))[1]
 
     # some at a time: of a large garment all together would not fit into memory
     values, vectors = jnp.linalg.eigh(jax.lax.map(column, jnp.eye(size), batch_size=COLUMNS))
-    inverse = 1.0 / (jnp.maximum(values, 0.0) + config.descent_damping)
+    inverse = 1.0 / (jnp.maximum(values, 0.0) + damping)
     return jnp.matmul(vectors * inverse[None], vectors.T, precision="highest")
 
 
@@ -213,30 +224,29 @@ def step(
     """One step of Phi: the next positions [V, 3] m (relative to the current root), its latent code [L], its inputs.
 
     Args:
-        potential: of next positions [V, 3] m in J. Of it, the force and the Newton step at the held garment are used.
+        potential: of next positions [V, 3] m in J.
     """
 
-    def garment(latent):
-        return decode(params, scene, character, latent, window, model)
-
-    if "descent" in params:
+    if "inverse_hessian" in params:
         fixed, now = jax.lax.stop_gradient((params, state.latent))
 
-        def held_garment(latent):
+        def garment(latent):
             return decode(fixed, scene, character, latent, window, model)
 
-        held, force, push = newton_step(fixed["descent"], now, held_garment, potential, model)
+        def precondition(gradient):
+            # the Hessian in the space of codes hardly changes but for contact
+            return jnp.matmul(fixed["inverse_hessian"], gradient, precision="highest")
+
+        guess = descend(precondition, now, garment, potential, model.descent_steps, model.descent_bound)
+        guessed = garment(guess)
     else:
-        displaced = skinning.unapply(window.current.garment, state.position)
-        held = skinning.apply(window.following.garment, displaced)
-        force = -jax.grad(potential)(held)
-    seen = feature.features(scene, character, state, window, contact, timestep, held, force, model, material)
+        guess = 0.0
+        guessed = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, state.position))
+    force = -jax.grad(potential)(guessed)
+    seen = feature.features(scene, character, state, window, contact, timestep, guessed, force, model, material)
     seen = jax.lax.stop_gradient(seen)
-    processed = pass_messages(params, statistics, scene, seen, model)
-    latent = convolve(params, scene, processed, model)
-    if "descent" in params:
-        latent += (1.0 - model.latent_decay) * state.latent + push + push @ params["descent"]["correction"]
-    return garment(latent), latent, seen
+    latent = guess + convolve(params, scene, pass_messages(params, statistics, scene, seen, model), model)
+    return decode(params, scene, character, latent, window, model), latent, seen
 
 
 def decode(params: Params, scene: Scene, character: Character, latent: Array, window: Window, model: ModelConfig):

@@ -150,24 +150,23 @@ class ModelConfig:
     convolution: tuple[Level, ...] = (Level(64), Level(64))
     convolution_bases: int = 8
     residual_rate: float = 0.5
-    latent: int = 240
+    latent: int = 400
     """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
     latent_update: Literal["absolute", "descent"] = "descent"
-    """Whether the network gives Z as in the thesis, or its change from the current frame's Z. The change then has a
-    second part: nearly a Newton step on the potential, from where the garment would be if held, and a learned linear
-    correction of it."""
+    """Whether the network gives Z as in the thesis, or what is missing from a guess: the current frame's Z after some
+    steps down the potential of the garment that it decodes to."""
+    descent_steps: int = 16
+    """Conjugate-gradient steps of the guess."""
     descent_damping: float = 0.1
     """J, added to the Hessian of unit codes: folds are stiffer than the rest shape."""
     descent_bound: float = 0.3
-    """Length of the step in Z that it cannot exceed."""
-    latent_decay: float = 0.1
-    """Part of Z forgotten in a frame, when the network gives its change: without it, what moves no vertex drifts."""
+    """Length in Z that a step cannot exceed."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
     decoder_skip: bool = True
     """Adds a linear map of Z to the decoder's output, which the thesis has not. Narrow ReLU layers alone leave the
     blend-shape weights few directions to move in."""
-    blendshapes: int = 192
+    blendshapes: int = 384
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
     normalizer_steps: int = 2000
@@ -187,6 +186,19 @@ class ModelConfig:
         for stack in self.processor:
             unknown = set(stack.edges) - known
             _require(not unknown, f"unknown edge sets {sorted(unknown)}; allowed: {sorted(known)}")
+
+
+@dataclass(frozen=True)
+class ShapesConfig:
+    """The cloth whose principal components the blend shapes start from: moved by the physics, all vertices free."""
+
+    sequences: int = 44
+    """Closed loops, each of its own clip, betas and material; 0: smooth shapes, eigenvectors of the Laplacian."""
+    frames: int = 60
+    descent_steps: int = 30
+    """Conjugate-gradient steps of a frame."""
+    farthest: float = 0.4  # m, a sequence in which a vertex is displaced farther is left out
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -213,7 +225,7 @@ class Stage1Config:
     """Fraction of the steps at full rate; then exponential decay ..."""
     decay_end: float = 0.03
     """... to this fraction of it."""
-    blendshape_rate: float = 0.1
+    blendshape_rate: float = 0.03
     """Learning rate of the blend shapes, relative."""
     adam_b2: float = 0.99
     clip: float = 1.0
@@ -285,8 +297,11 @@ class Config:
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
+    shapes: ShapesConfig = field(default_factory=ShapesConfig)
     stage1: Stage1Config = field(default_factory=Stage1Config)
     stage2: Stage2Config = field(default_factory=Stage2Config)
+    tuning: Stage1Config = Stage1Config(steps=0, learning_rate=1e-4, start_timestep=0.0)
+    """Training of Psi on the physics, after its regression: like stage 1, with Psi in the place of Phi."""
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     directory: str = ""
     """Where the run is kept; empty: runs/<name of the config file>."""

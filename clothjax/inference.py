@@ -86,7 +86,7 @@ def build(
 
 
 def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
-    """The model of a finished run: the folder that holds `stage2`, or a shipped model.
+    """The model of a finished run: the folder that holds `stage2`, and `tuning` where Psi was tuned.
 
     Args:
         betas: [S] body shape; default the mean body.
@@ -98,6 +98,9 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
     directory = Path(run) / "stage2" / "checkpoints"
     parts, about = checkpoint.read(directory, "average", "normalizers", "garment")
     config = configuration.from_dict(Config, about.config, str(directory))
+    predictor, tuned = parts["average"], Path(run) / "tuning" / "checkpoints"
+    if checkpoint.steps(tuned):
+        predictor = checkpoint.read(tuned, "average")[0]["average"]
     body = storage.load_body(config.body)
     return build(
         config,
@@ -105,7 +108,7 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
         body,
         storage.joint_names(config.body),
         parts["garment"],
-        parts["average"],
+        predictor,
         Normalizers(*(Scale(**parts["normalizers"][name]) for name in Normalizers._fields)),
         betas=betas,
         material=material,

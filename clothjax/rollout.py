@@ -1,5 +1,6 @@
 """One simulated frame of Phi, and rollouts: a scan of frames with the losses accumulated inside."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -22,7 +23,14 @@ class Taken(NamedTuple):
 
     new: Array  # [V, 3] m, relative to the root at the current frame
     step: TimeStep
-    seen: Features
+    seen: Features | None  # what Phi saw
+
+
+Animator = Callable[
+    [ClothState, Pose, Window, TimeStep, Callable[[Array], Array]], tuple[Array, Array, Features | None]
+]
+"""From a state, three poses, the character's three frames, a time step and its potential: the next positions [V, 3] m,
+their code [L], and what was seen."""
 
 
 def start(character: Character, window: Window, latent_size: int) -> ClothState:
@@ -67,25 +75,35 @@ def time_step(
     )
 
 
+def phi(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
+    """Phi, of `params` and `statistics`, as what moves a character's garment."""
+
+    def animate(state: ClothState, _poses: Pose, window: Window, step: TimeStep, potential: Callable):
+        return compact_latent.step(
+            model["params"], model["statistics"], scene, character, state, window, step.contact,
+            step.timestep, potential, config.model, config.material,
+        )  # fmt: skip
+
+    return animate
+
+
 def take(
-    model: dict,
+    animate: Animator,
     scene: Scene,
     character: Character,
     state: ClothState,
-    window: Window,
+    poses: Pose,
     timestep: Array,
     config: Config,
 ) -> tuple[ClothState, Taken]:
-    """One frame of Phi; `model` holds `params` and `statistics`. The state returned is still at the current root."""
+    """One frame; the state returned is still relative to the current root."""
+    window = characters.window(scene, character, poses)
     step = time_step(scene, character, state, window, timestep, config)
 
     def potential(new):
         return losses.potential(new, step, scene.mesh, config.physics)
 
-    new, latent, seen = compact_latent.step(
-        model["params"], model["statistics"], scene, character, state, window, step.contact,
-        step.timestep, potential, config.model, config.material,
-    )  # fmt: skip
+    new, latent, seen = animate(state, poses, window, step, potential)
     velocity = new - state.position
     return ClothState(new, velocity, velocity - state.velocity, latent), Taken(new, step, seen)
 
@@ -95,23 +113,18 @@ def follow(state: ClothState, advance: Array) -> ClothState:
     return state._replace(position=state.position - advance[None])
 
 
-def settle(model: dict, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
+def settle(animate: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
     """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
-    window = characters.window(scene, character, poses)
-    size = _latent_size(scene, config)
-    state = start(character, window, size)
+    state = start(character, characters.window(scene, character, poses), _latent_size(scene, config))
     if config.stage1.start_timestep == 0:
         return state
-    settled, _ = take(
-        model, scene, character, state._replace(velocity=jnp.zeros_like(state.velocity)),
-        Window(window.current, window.current, window.current), config.stage1.start_timestep, config,
-    )  # fmt: skip
+    resting = state._replace(velocity=jnp.zeros_like(state.velocity))
+    settled, _ = take(animate, scene, character, resting, motion.standing(poses), config.stage1.start_timestep, config)
     return settled._replace(velocity=state.velocity, acceleration=state.acceleration)
 
 
 def training_rollout(
-    params: dict,
-    statistics: dict,
+    animate: Animator,
     scene: Scene,
     character: Character,
     state: ClothState,
@@ -122,7 +135,7 @@ def training_rollout(
     frames: int,
     config: Config,
 ) -> tuple[Array, tuple[ClothState, dict, Features]]:
-    """Mean loss over `frames` frames of Phi from a state, with the last state, mean energies in J, and all features.
+    """Mean loss over `frames` frames from a state, with the last state, mean energies in J, and all features.
 
     A `fresh` state takes the quasi-static step first: the body stands, the step is long, and what it started with as
     velocity is given back after it. Gradients reach back over `config.stage1.gradient_frames` frames.
@@ -135,12 +148,10 @@ def training_rollout(
         poses = motion.poses(clips, frame)
         still = motion.standing(poses)
         chosen = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), still, poses)
-        window = characters.window(scene, character, chosen)
         velocity = jnp.where(fresh, 0.0, state.velocity)
         timestep = jnp.where(fresh, config.stage1.start_timestep, 1.0 / config.fps)
-        model = {"params": params, "statistics": statistics}
         taken, (new, step, seen) = take(
-            model, scene, character, state._replace(velocity=velocity), window, timestep, config
+            animate, scene, character, state._replace(velocity=velocity), chosen, timestep, config
         )
         terms = losses.present(losses.energies(new, step, scene.mesh, config.physics), config.loss)
         loss = losses.weighted(terms, config.loss, training_step)
@@ -168,11 +179,11 @@ def play(model: dict, scene: Scene, character: Character, poses: Pose, config: C
         (new [T, V, 3] m relative to each window's current root, states before each step [T], latents [T, L]).
     """
     first = jax.tree.map(lambda x: x[0], poses)
-    state = settle(model, scene, character, first, config)
+    animate = phi(model, scene, character, config)
+    state = settle(animate, scene, character, first, config)
 
     def body(state, poses):
-        window = characters.window(scene, character, poses)
-        taken, (new, _, _) = take(model, scene, character, state, window, 1.0 / config.fps, config)
+        taken, (new, _, _) = take(animate, scene, character, state, poses, 1.0 / config.fps, config)
         return follow(taken, poses.translation[2]), (new, state, taken.latent)
 
     return jax.lax.scan(body, state, poses)[1]

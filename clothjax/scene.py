@@ -3,9 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
-import scipy.sparse.linalg
 from scipy.spatial import cKDTree
 
 from clothjax import graph_sampling, topology
@@ -126,39 +123,3 @@ def _part(body: Body, kept: np.ndarray, faces: np.ndarray) -> Body:
 def _box(vertices: np.ndarray) -> str:
     low, high = np.min(vertices, axis=0), np.max(vertices, axis=0)
     return f"from {np.round(low, 2).tolist()} to {np.round(high, 2).tolist()} m"
-
-
-def laplacian_basis(scene: Scene, count: int, stiffness: float, density: float, timestep: float) -> np.ndarray:
-    """Blend shapes [K, V, 3] m to start training from: mass-scaled Laplacian eigenvectors, each along x, y and z.
-
-    Mode i is divided by sqrt(w_i + 1 / dt^2), so that a unit weight costs about the same energy in every mode
-    (stretching by `stiffness` N/m, inertia over `timestep` s). Pinned vertices do not move.
-    """
-    vertices = np.asarray(scene.garment.vertices, np.float64)
-    edges = topology.edges(np.asarray(scene.garment.faces))
-    free = np.flatnonzero(~np.asarray(scene.garment.pinned))
-    corners = vertices[np.asarray(scene.garment.faces)]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    mass = np.zeros(len(vertices))
-    np.add.at(mass, np.asarray(scene.garment.faces).ravel(), np.repeat(area * density / 3, 3))
-    ends = np.concatenate([edges, edges[:, ::-1]]).T
-    springs = scipy.sparse.coo_array((np.full(2 * len(edges), stiffness), ends), shape=(len(vertices),) * 2)
-    laplacian = (scipy.sparse.diags_array(springs.sum(axis=1)) - springs).tocsc()[free][:, free]
-    modes = min(-(-count // 3), len(free))
-    if modes < len(free) // 2:
-        values, vectors = scipy.sparse.linalg.eigsh(
-            laplacian,
-            modes,
-            scipy.sparse.diags_array(mass[free]).tocsc(),
-            sigma=-1 / timestep**2,
-            v0=np.random.default_rng(0).standard_normal(len(free)),
-        )
-    else:
-        values, vectors = scipy.linalg.eigh(laplacian.toarray(), np.diag(mass[free]), subset_by_index=[0, modes - 1])
-    scaled = vectors / np.sqrt(np.maximum(values, 0) + 1 / timestep**2)
-    basis = np.zeros((modes, 3, len(vertices), 3))
-    for axis in range(3):
-        basis[:, axis, free, axis] = scaled.T
-    basis = basis.reshape(-1, len(vertices), 3)[:count]
-    missing = count - len(basis)
-    return np.concatenate([basis, np.zeros((missing, *basis.shape[1:]))]).astype(np.float32)

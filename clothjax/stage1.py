@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
+from clothjax import blendshapes, compact_latent, devices, fit, garment_model, losses, rollout
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, devices, fit, losses, rollout
 from clothjax import features as feature
 from clothjax.character import Character, Window
 from clothjax.clips import Clips
@@ -20,8 +20,11 @@ from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.fit import Weights
 from clothjax.losses import TimeStep
-from clothjax.scene import Scene, laplacian_basis
+from clothjax.rollout import Animator
+from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Material
+
+MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
 
 
 class Simulation(NamedTuple):
@@ -114,19 +117,24 @@ def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
     return Simulation(cloth, betas, material, frame, jnp.asarray(config.stage1.start_timestep > 0))
 
 
-def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
-    """The state before the first step."""
+def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None) -> TrainingState:
+    """The state before the first step; `shapes` [K, V, 3] m start the blend shapes, by default smooth ones."""
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
-    stiffness = physical_stiffness(config)
-    basis = laplacian_basis(scene, config.model.blendshapes, stiffness, config.material.density, 1.0 / config.fps)
+    basis = blendshapes.laplacian(scene, config) if shapes is None else shapes
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
     example = jax.eval_shape(lambda k: first_step(scene, begin(k, scene, clips, config), clips, config), key).seen
     params = jax.jit(lambda k: compact_latent.init(k, scene, example, 0.1 * basis, config.model))(model_key)
     if config.model.latent_update == "descent":
-        params["descent"]["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(
-            params["garment"]
-        )
+        params["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(params["garment"])
+    statistics = compact_latent.init_statistics(example)
+    return starting(params, statistics, key, pool_key, scene, clips, config)
+
+
+def starting(
+    params: dict, statistics: dict, key: Array, pool_key: Array, scene: Scene, clips: Clips, config: Config
+) -> TrainingState:
+    """The state before the first step of training such parameters."""
     pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(jax.random.split(pool_key, config.stage1.pool))
     return TrainingState(
         step=jnp.int32(0),
@@ -134,13 +142,25 @@ def init(scene: Scene, clips: Clips, config: Config) -> TrainingState:
         params=params,
         average=jax.tree.map(jnp.array, params),
         optimizer=optimizer(config).init(params),
-        statistics=compact_latent.init_statistics(example),
+        statistics=statistics,
         pool=pool,
     )
 
 
 def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
-    """The inverse Hessian [L, L] of a time step of the configured cloth in the canonical pose, touching nothing."""
+    """The inverse Hessian [L, L] in 1/J of `rest_energy` over codes near zero."""
+    energy = rest_energy(scene, config)
+    free = jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
+    left, channels = compact_latent.latent_size(scene, config.model)
+
+    def of_code(latent):
+        return energy(garment_model.displacement(garment, latent, free, config.model))
+
+    return compact_latent.inverse_hessian(of_code, left * channels, config.model.descent_damping)
+
+
+def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
+    """The potential of displacements [V, 3] m of the configured cloth, in the canonical pose and touching nothing."""
     character = characters.dress(
         scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
     )
@@ -155,17 +175,7 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
         touching=None,
         timestep=jnp.float32(1.0 / config.fps),
     )
-    left, channels = compact_latent.latent_size(scene, config.model)
-
-    def potential(displacement):
-        return losses.potential(rest + displacement, step, scene.mesh, config.physics)
-
-    return compact_latent.inverse_hessian(potential, garment, left * channels, config.model)
-
-
-def physical_stiffness(config: Config) -> float:
-    """Membrane stiffness of the configured cloth in N/m, as the Laplacian of a spring network would have it."""
-    return 0.25 * 4.7e-4 * (2 * config.material.mu + config.material.lam)
+    return lambda displacement: losses.potential(rest + displacement, step, scene.mesh, config.physics)
 
 
 class FirstStep(NamedTuple):
@@ -197,7 +207,12 @@ def rollout_length(step: int, config: Config) -> int:
 
 
 def make_curriculum(
-    scene: Scene, clips: Clips, config: Config, steps: int, device_mesh: Mesh | None = None
+    scene: Scene,
+    clips: Clips,
+    config: Config,
+    steps: int,
+    device_mesh: Mesh | None = None,
+    animator: MakeAnimator = rollout.phi,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """`make_update` with the rollout growing as training proceeds; one compilation for each length."""
     made = {}
@@ -205,18 +220,27 @@ def make_curriculum(
     def update(state: TrainingState):
         frames = rollout_length(int(state.step), config)
         if frames not in made:
-            made[frames] = make_update(scene, clips, config, frames, steps, device_mesh)
+            made[frames] = make_update(scene, clips, config, frames, steps, device_mesh, animator)
         return made[frames](state)
 
     return update
 
 
 def make_update(
-    scene: Scene, clips: Clips, config: Config, frames: int, steps: int, device_mesh: Mesh | None = None
+    scene: Scene,
+    clips: Clips,
+    config: Config,
+    frames: int,
+    steps: int,
+    device_mesh: Mesh | None = None,
+    animator: MakeAnimator = rollout.phi,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """A jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
 
     It consumes its argument (buffers are donated). The simulations of a batch are spread over the devices.
+
+    Args:
+        animator: what is trained, made of its `params` and `statistics`.
     """
     stage = config.stage1
     transform = optimizer(config)
@@ -224,8 +248,9 @@ def make_update(
     def part(simulations, params, statistics, step, clips):
         def loss(params, simulation):
             character = wearer(scene, simulation.betas, simulation.material, config)
+            animate = animator({"params": params, "statistics": statistics}, scene, character, config)
             return rollout.training_rollout(
-                params, statistics, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
+                animate, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
                 step, frames, config,
             )  # fmt: skip
 
@@ -262,13 +287,15 @@ def make_update(
         cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
         following = Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
 
-        statistics = jax.lax.cond(
-            metrics["nonfinite"] | (state.step >= config.model.normalizer_steps),
-            lambda statistics, _: statistics,
-            compact_latent.observe,
-            state.statistics,
-            seen,
-        )
+        statistics = state.statistics
+        if seen is not None:
+            statistics = jax.lax.cond(
+                metrics["nonfinite"] | (state.step >= config.model.normalizer_steps),
+                lambda statistics, _: statistics,
+                compact_latent.observe,
+                statistics,
+                seen,
+            )
         new = TrainingState(
             step=state.step + 1,
             key=state.key,

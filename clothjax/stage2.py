@@ -1,9 +1,7 @@
 """Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (21)."""
 
-import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -14,15 +12,13 @@ import optax
 from jax.sharding import Mesh
 
 from clothjax import clips as motion
-from clothjax import devices, fit, garment_model, latent_predictor, rollout, stage1
+from clothjax import devices, fit, garment_model, latent_predictor, rollout, sampling, stage1
 from clothjax.clips import Clips
 from clothjax.config import Config, ModelConfig
 from clothjax.fit import Weights
 from clothjax.latent_predictor import Normalizers
 from clothjax.scene import Scene
 from clothjax.types import Array, Pose
-
-ON_CPU, ELSEWHERE = 4, 64  # sequences of the teacher in one program
 
 
 class Teacher(NamedTuple):
@@ -66,7 +62,6 @@ def teach(
     stage = config.stage2
     fps = config.fps
     began = time.monotonic()
-    clips = devices.replicate(clips, device_mesh)
 
     def sequence(key: Array, model: dict, clips: Clips):
         simulation = stage1.begin(key, scene, clips, config)
@@ -85,25 +80,9 @@ def teach(
         first = jnp.zeros_like(latents[:1])
         return jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants
 
-    rollouts = devices.shard(jax.vmap(sequence, (0, None, None)), device_mesh)
-    run = jax.jit(rollouts, out_shardings=devices.replicated(device_mesh))
-    keys = jax.random.split(jax.random.key(stage.seed + 1), stage.sequences)
-    alone = device_mesh is None
-    on_cpu = jax.default_backend() == "cpu"
-    among = 1 if alone else device_mesh.size
-    size = among * min(ON_CPU if on_cpu else ELSEWHERE, -(-stage.sequences // among))
-
-    def some(start: int):
-        rows = np.arange(start, start + size) % stage.sequences
-        return jax.device_get(run(devices.replicate(keys[rows], device_mesh), model, clips))
-
-    parts = []
-    # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
-    with ThreadPoolExecutor(os.cpu_count() if on_cpu and alone else 1) as pool:
-        for part in pool.map(some, range(0, stage.sequences, size)):
-            parts.append(part)
-            progress(min(len(parts) * size, stage.sequences))
-    teacher = Teacher(*(np.concatenate(part)[: stage.sequences] for part in zip(*parts)))
+    teacher = Teacher(
+        *sampling.sample(sequence, (model, clips), stage.sequences, stage.seed + 1, progress, device_mesh)
+    )
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
         raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")

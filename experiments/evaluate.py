@@ -11,8 +11,14 @@ solver: every number is about the stage's own trajectory, with the configured ma
                     given the stage's own two previous frames, E_min the reference solver's minimum from the same two.
                     0 is the solver, 1 plain skinning. The mean is of sums over the frames sampled.
     hold_gap        the same with E_hold for E_skinned: the last canonical displacement kept. 1 is no dynamics at all.
+    span_gap        the same with the minimum in the span of the learned blend shapes for E: what Phi lacks for lack of
+                    shapes, the rest for lack of training.
     step_error_mm   mean (`_p95`, `_max`) distance of vertices to that minimum.
-    penetration_percent, penetration_max_mm   vertices inside the whole body (winding number), and the deepest.
+    penetration_percent, penetration_max_mm   vertices inside the whole body (winding number), and the deepest;
+                    `penetration_by_joint`, of each motion: where.
+    swing_ratio, swing_correlation            of the velocity of what skinning does not do, beside the solver's in its
+                    own closed loop: 1 is as lively; `rollout_error_mm` is the distance to it, `wrinkle_ratio` the rms
+                    dihedral angle over its.
     edge_strain_p95, edge_strain_max          of |l / l_0 - 1|.
     jitter          rms of the second time difference of vertex accelerations, over the solver's own in closed loop.
     psi_phi_mm      mean vertex distance of Psi to Phi, over the first motion played there and back for
@@ -111,13 +117,22 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
     result = {"solver": {"frames": count, "converged": float(np.mean([info.converged for info in infos]))}}
     for stage, track in tracks.items():
         measured = metrics.gaps(
-            metrics.step_measures(whole.scene, character, jnp.asarray(track), poses, sampled, config)
+            metrics.step_measures(
+                whole.scene,
+                character,
+                jnp.asarray(track),
+                poses,
+                sampled,
+                config,
+                phi["params"]["garment"]["blendshapes"] if stage == "phi" else None,
+            )
         )
         if whole.scene.touchable:
             measured |= metrics.penetrations(
-                whole.scene, whole.body, jnp.asarray(betas), track, poses, range(SETTLING, frames, 4)
+                whole.scene, whole.body, jnp.asarray(betas), track, poses, range(SETTLING, frames, 4), whole.names
             )
         measured |= metrics.edge_strain(whole.scene, character, track[SETTLING:])
+        measured |= metrics.beside_solver(whole.scene, *(x[SETTLING:count] for x in (track, solved, tracks["lbs"])))
         measured["jitter"] = metrics.roughness(track[SETTLING:count], advance[SETTLING : count - 1]) / rough
         result[stage] = measured
     done(4)
@@ -200,7 +215,9 @@ def _cell(value) -> str:
 def _mean(results: list[dict[str, float]]) -> dict[str, float]:
     # a maximum over motions stays a maximum
     return {
-        key: float((np.max if "max" in key else np.mean)([result[key] for result in results])) for key in results[0]
+        key: float((np.max if "max" in key else np.mean)([result[key] for result in results]))
+        for key, value in results[0].items()
+        if isinstance(value, float)
     }
 
 

@@ -4,7 +4,8 @@
     python -m experiments.train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
     python -m experiments.train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
 
-It leaves `stage1/` and `stage2/` in the run's folder, each with checkpoints, metrics.jsonl and training.json.
+It leaves `stage1/`, `stage2/` and, where `tuning.steps` is not 0, `tuning/` in the run's folder, each with
+checkpoints, metrics.jsonl and training.json.
 
 With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
 Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere each is told
@@ -13,12 +14,24 @@ Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere
 
 import argparse
 import sys
+import time
 from pathlib import Path
 
 import jax
 from jax.sharding import Mesh
 
-from clothjax import checkpoint, configuration, devices, experiment, fit, latent_predictor, stage1, stage2
+from clothjax import (
+    checkpoint,
+    configuration,
+    devices,
+    experiment,
+    fit,
+    latent_predictor,
+    principal_shapes,
+    stage1,
+    stage2,
+    tuning,
+)
 from clothjax.config import Config
 from clothjax.features import Statistics
 from experiments.session import fail_clearly, progress, setup
@@ -45,7 +58,7 @@ def run_directory(config: Config, argv: list[str]) -> Path:
 
 
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
-    """Both stages; returns the seconds each took, with `compile_seconds` and `teacher_seconds` apart."""
+    """Both stages and the tuning; returns the seconds each took, `compile_seconds` and `teacher_seconds` apart."""
     if device_mesh is not None:
         devices.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     whole = experiment.assemble(config)
@@ -57,10 +70,17 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
             devices.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
     kept = configuration.to_dict(config)
 
+    began, shapes = time.monotonic(), None
+    if config.shapes.sequences > 0 and not checkpoint.steps(directory / "stage1" / "checkpoints"):
+        devices.say(f"blend shapes: from {config.shapes.sequences} closed loops of cloth that the physics moves")
+        with progress("simulating", config.shapes.sequences) as report:
+            shapes = principal_shapes.principal(whole.scene, reel, config, report, device_mesh)
+    shapes_seconds = time.monotonic() - began
+
     devices.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     first = fit.fit(
         stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, device_mesh),
-        devices.replicate(stage1.init(whole.scene, reel, config), device_mesh),
+        devices.replicate(stage1.init(whole.scene, reel, config, shapes), device_mesh),
         steps=config.stage1.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage1",
@@ -84,18 +104,36 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         directory=directory / "stage2",
         config=kept,
         description=f"stage 2, {config.garment}",
-        may_differ=("directory", "evaluation"),
+        may_differ=("directory", "evaluation", "tuning"),
     )
-    return {
+    clock = {
+        "shapes_seconds": shapes_seconds,
         "stage1_seconds": first.seconds,
         "stage2_seconds": second.seconds,
         "teacher_seconds": seconds,
         "compile_seconds": first.compile_seconds + second.compile_seconds,
     }
+    if config.tuning.steps == 0:
+        return clock
+
+    devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
+    psi = tuning.psi(second.state.garment, second.state.normalizers, joints)
+    third = fit.fit(
+        stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
+        devices.replicate(tuning.init(second.state.average, whole.scene, reel, config), device_mesh),
+        steps=config.tuning.steps,
+        steps_per_call=STEPS_PER_CALL,
+        directory=directory / "tuning",
+        config=kept,
+        description=f"tuning, {config.garment}",
+        may_differ=("directory", "evaluation"),
+    )
+    clock["compile_seconds"] += third.compile_seconds
+    return clock | {"tuning_seconds": third.seconds}
 
 
 # stage 1 does not read these, so a run may change them and go on
-DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2")
+DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning")
 
 
 def load_phi(directory: Path) -> tuple[experiment.Experiment, dict]:

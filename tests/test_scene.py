@@ -36,8 +36,10 @@ def flops(whole):
         def loss(params, statistics, pool, clips, built=built):
             one = jax.tree.map(lambda x: x[0], pool)
             character = stage1.wearer(built.scene, one.betas, one.material, built.config)
+            model = {"params": params, "statistics": statistics}
+            phi = rollout.phi(model, built.scene, character, built.config)
             return rollout.training_rollout(
-                params, statistics, built.scene, character, one.cloth, clips, one.frame, one.fresh,
+                phi, built.scene, character, one.cloth, clips, one.frame, one.fresh,
                 jnp.int32(0), 1, built.config,
             )[0]  # fmt: skip
 

@@ -103,6 +103,10 @@ def _untrained(whole, reel):
     return state, one, characters.dress(whole.scene, one.betas, one.material, whole.config.physics)
 
 
+def _phi(whole, state, params, character):
+    return rollout.phi({"params": params, "statistics": state.statistics}, whole.scene, character, whole.config)
+
+
 def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     whole, reel = toy
     config, scene = whole.config, whole.scene
@@ -112,7 +116,7 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     @jax.jit
     def one_update(state, cloth):
         return rollout.training_rollout(
-            state.params, state.statistics, scene, character, cloth, reel, one.frame, jnp.asarray(True),
+            _phi(whole, state, state.params, character), scene, character, cloth, reel, one.frame, jnp.asarray(True),
             state.step, 1, config,
         )  # fmt: skip
 
@@ -137,7 +141,7 @@ def test_gradients_go_through_as_many_frames_as_configured(toy):
 
         def loss(params):
             return rollout.training_rollout(
-                params, state.statistics, scene, character, one.cloth, reel, one.frame, jnp.asarray(False),
+                _phi(whole, state, params, character), scene, character, one.cloth, reel, one.frame, jnp.asarray(False),
                 state.step, 2, dataclasses.replace(config, stage1=stage),
             )[0]  # fmt: skip
 

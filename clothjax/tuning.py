@@ -1,0 +1,58 @@
+"""Psi after its regression, trained on by the physics of its own closed loop."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax import compact_latent, latent_predictor, stage1
+from clothjax.character import Character, Window
+from clothjax.clips import Clips
+from clothjax.config import Config
+from clothjax.latent_predictor import Normalizers
+from clothjax.losses import TimeStep
+from clothjax.rollout import Animator
+from clothjax.scene import Scene
+from clothjax.stage1 import MakeAnimator
+from clothjax.types import ClothState, Pose
+
+
+def settings(config: Config) -> Config:
+    """The configuration with that of the tuning in the place of stage 1's."""
+    return dataclasses.replace(config, stage1=config.tuning)
+
+
+def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.TrainingState:
+    """The state before the first step."""
+    key, pool_key = jax.random.split(jax.random.key(config.tuning.seed))
+    clips = jax.tree.map(jnp.asarray, clips)
+    return stage1.starting(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
+
+
+def psi(garment: dict, normalizers: Normalizers, kept: np.ndarray) -> MakeAnimator:
+    """Psi, of `params`, as what moves a character's garment: with a frozen decoder, on the joints `kept`."""
+
+    def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
+        constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
+
+        def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, _potential: Callable):
+            advance = jnp.stack([poses.translation[2], -poses.translation[0]])
+            inputs = latent_predictor.pose_inputs(
+                poses.rotations[::-1], advance, character.joints, scene.body.parents, kept, config.fps
+            )
+            latent = latent_predictor.predict(
+                model["params"],
+                latent_predictor.normalise(normalizers.latent, state.latent),
+                latent_predictor.normalise(normalizers.pose, inputs),
+                constants,
+                config.stage2.latent_decay,
+            )
+            latent = latent_predictor.denormalise(normalizers.latent, latent)
+            new = compact_latent.decode({"garment": garment}, scene, character, latent, window, config.model)
+            return new, latent, None
+
+        return animate
+
+    return make

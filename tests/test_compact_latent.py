@@ -1,0 +1,91 @@
+"""Phi's guess: down the potential in the space of codes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from clothjax import compact_latent
+
+START = jnp.array([0.3, -1.0, 0.7])
+GOAL = jnp.array([1.0, 0.0, -2.0])
+
+
+def descend(inverse, start, decode, potential, steps=1, bound=1e6):
+    return compact_latent.descend(lambda g: inverse @ g, start, decode, potential, steps, bound)
+
+
+@pytest.fixture
+def coded():
+    """The garment of 5 vertices of 3 codes, its squared distance to a goal, and the inverse Hessian of that."""
+    basis = np.random.default_rng(0).normal(size=(3, 5, 3)).astype(np.float32)
+
+    def decode(latent):
+        return jnp.einsum("k,kvc->vc", latent, basis, precision="highest")
+
+    goal = decode(GOAL)
+
+    def potential(positions):
+        return jnp.sum((positions - goal) ** 2)
+
+    return compact_latent.inverse_hessian(lambda z: potential(decode(z)), 3, 1e-9), decode, potential
+
+
+def test_one_step_reaches_the_minimum_of_a_quadratic(coded):
+    inverse, decode, potential = coded
+    np.testing.assert_allclose(descend(inverse, START, decode, potential), GOAL, atol=1e-4)
+    np.testing.assert_allclose(descend(inverse, GOAL, decode, potential), GOAL, atol=1e-5)
+    done = descend(inverse, START, decode, lambda x: 1e6 * potential(x), bound=0.1)
+    assert float(jnp.linalg.norm(done - START)) == pytest.approx(0.1, rel=1e-2)
+
+
+def test_steps_are_conjugate():
+    """Without a preconditioner, as many steps as there are codes reach the minimum of an uneven quadratic."""
+    weights = jnp.array([1.0, 30.0, 400.0])
+
+    def potential(positions):
+        return 0.5 * jnp.sum(weights[:, None] * (positions - GOAL[:, None]) ** 2)
+
+    def decode(latent):
+        return jnp.broadcast_to(latent[:, None], (3, 3))
+
+    def left(steps):
+        done = descend(jnp.eye(3), START, decode, potential, steps)
+        return float(jnp.linalg.norm(done - GOAL))
+
+    assert left(3) < 1e-3 * left(2)
+
+
+def test_no_step_overshoots_what_the_hessian_does_not_know(coded):
+    """A floor a thousand times stiffer than the cloth: every step goes down, and many end at the minimum."""
+    inverse, decode, potential = coded
+
+    def stiff(positions):
+        return potential(positions) + 1e3 * jnp.sum(jnp.maximum(0.5 - positions[:, 1], 0.0) ** 2)
+
+    ends = {n: descend(inverse, START, decode, stiff, n) for n in (1, 4, 60)}
+    energies = [float(stiff(decode(z))) for z in (START, *ends.values())]
+    assert energies == sorted(energies, reverse=True)
+    slope = jax.grad(lambda z: stiff(decode(z)))
+    assert jnp.linalg.norm(slope(ends[60])) < 1e-3 * jnp.linalg.norm(slope(START))
+    # what the rest Hessian alone would do is worse than to stay
+    assert stiff(decode(START - inverse @ slope(START))) > energies[0]
+
+
+def test_where_the_potential_has_no_minimum_or_is_at_one(coded):
+    inverse, decode, potential = coded
+    away = descend(inverse, START, decode, lambda x: -potential(x))
+    # as long as the cloth at rest would have it, and downhill
+    np.testing.assert_allclose(away - START, START - GOAL, atol=1e-4)
+    still = descend(inverse, START, decode, lambda x: 0.0 * jnp.sum(x), 3)
+    np.testing.assert_array_equal(still, START)
+    uphill = descend(-inverse, START, decode, potential)
+    np.testing.assert_array_equal(uphill, START)
+
+
+def test_a_softer_cloth_goes_farther(coded):
+    inverse, decode, potential = coded
+    done = descend(inverse, START, decode, lambda x: potential(x) / 3)
+    np.testing.assert_allclose(done, GOAL, atol=1e-4)
+    done = descend(inverse, START, decode, lambda x: potential(x) / 400)
+    np.testing.assert_allclose(done - START, compact_latent.MAX_LENGTH / 400 * (GOAL - START), rtol=1e-3)
