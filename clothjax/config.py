@@ -225,8 +225,9 @@ class Stage1Config:
     """Fraction of the steps at full rate; then exponential decay ..."""
     decay_end: float = 0.03
     """... to this fraction of it."""
-    blendshape_rate: float = 0.03
-    """Learning rate of the blend shapes, relative."""
+    blendshape_rate: float = 0.0
+    """Learning rate of the blend shapes, relative. 0 keeps those that they start from: principal shapes that were
+    trained on reach less of what the cloth does on new motions."""
     adam_b2: float = 0.99
     clip: float = 1.0
     ema: float = 0.995

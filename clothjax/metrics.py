@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import character as characters
-from clothjax import compact_latent, garment_model, losses, physics, simulation, skinning, solver, stage1, topology
+from clothjax import compact_latent, garment_model, losses, physics, rollout, simulation, skinning, solver, topology
 from clothjax.character import Character
 from clothjax.config import Config
 from clothjax.losses import TimeStep
@@ -87,7 +87,7 @@ def _search_span(scene: Scene, character: Character, blendshapes: Array, config:
     shapes = (np.asarray(blendshapes, np.float64) * free).reshape(len(blendshapes), -1)
     vectors = np.linalg.svd(shapes, full_matrices=False)[2].astype(np.float32)
     size = len(vectors)
-    rest = stage1.rest_energy(scene, config)
+    rest = rollout.rest_energy(scene, config)
     inertia = float(jnp.mean(character.mass)) * config.fps**2
     inverse = jax.jit(
         lambda: compact_latent.inverse_hessian(lambda w: rest((w @ vectors).reshape(-1, 3)), size, inertia)

@@ -12,6 +12,7 @@ from clothjax import compact_latent, contact, losses
 from clothjax.character import Character, Window
 from clothjax.clips import Clips
 from clothjax.config import Config
+from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.losses import TimeStep
 from clothjax.scene import Scene
@@ -85,6 +86,25 @@ def phi(model: dict, scene: Scene, character: Character, config: Config) -> Anim
         )  # fmt: skip
 
     return animate
+
+
+def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
+    """The potential of displacements [V, 3] m of the configured cloth, in the canonical pose and touching nothing."""
+    character = characters.dress(
+        scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
+    )
+    rest = character.template
+    step = TimeStep(
+        position=rest,
+        velocity=jnp.zeros_like(rest),
+        mass=character.mass,
+        rest=character.rest,
+        material=character.material,
+        contact=None,
+        touching=None,
+        timestep=jnp.float32(1.0 / config.fps),
+    )
+    return lambda displacement: losses.potential(rest + displacement, step, scene.mesh, config.physics)
 
 
 def take(

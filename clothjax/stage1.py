@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from clothjax import blendshapes, compact_latent, devices, fit, garment_model, losses, rollout
+from clothjax import blendshapes, compact_latent, devices, fit, garment_model, rollout
 from clothjax import character as characters
 from clothjax import clips as motion
 from clothjax import features as feature
@@ -148,8 +148,8 @@ def starting(
 
 
 def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
-    """The inverse Hessian [L, L] in 1/J of `rest_energy` over codes near zero."""
-    energy = rest_energy(scene, config)
+    """The inverse Hessian [L, L] in 1/J of `rollout.rest_energy` over codes near zero."""
+    energy = rollout.rest_energy(scene, config)
     free = jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
     left, channels = compact_latent.latent_size(scene, config.model)
 
@@ -157,25 +157,6 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
         return energy(garment_model.displacement(garment, latent, free, config.model))
 
     return compact_latent.inverse_hessian(of_code, left * channels, config.model.descent_damping)
-
-
-def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
-    """The potential of displacements [V, 3] m of the configured cloth, in the canonical pose and touching nothing."""
-    character = characters.dress(
-        scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
-    )
-    rest = character.template
-    step = TimeStep(
-        position=rest,
-        velocity=jnp.zeros_like(rest),
-        mass=character.mass,
-        rest=character.rest,
-        material=character.material,
-        contact=None,
-        touching=None,
-        timestep=jnp.float32(1.0 / config.fps),
-    )
-    return lambda displacement: losses.potential(rest + displacement, step, scene.mesh, config.physics)
 
 
 class FirstStep(NamedTuple):

@@ -79,9 +79,9 @@ def readable(report: dict, config: Config) -> str:
 
 Garment {config.garment}, motion {", ".join(config.evaluation.motions)} (not trained on), betas of seed
 {config.evaluation.betas_seed} within {config.evaluation.betas} standard deviations. Training took
-{figures["train_seconds"]:.0f} s: blend shapes {figures["shapes_seconds"]:.0f} s, stage 1 {figures["stage1_seconds"]:.0f} s, the teacher's rollouts
-{figures["teacher_seconds"]:.0f} s, stage 2 {figures["stage2_seconds"]:.0f} s, compilation
-{figures["compile_seconds"]:.0f} s.
+{figures["train_seconds"]:.0f} s: blend shapes {figures["shapes_seconds"]:.0f} s, stage 1
+{figures["stage1_seconds"]:.0f} s, the teacher's rollouts {figures["teacher_seconds"]:.0f} s, stage 2
+{figures["stage2_seconds"]:.0f} s, compilation {figures["compile_seconds"]:.0f} s.
 
 What the rows mean is in the docstring of `experiments/evaluate.py`. Gaps are over {config.evaluation.gap_frames}
 frames of each motion; 0 is the reference solver, 1 plain skinning (`energy_gap`) or a garment that keeps its last

@@ -15,7 +15,8 @@ TOY = [
     "--stage2.frames", "12", "--stage2.batch", "4", "--stage2.rollout", "2", "--model.width", "8",
     "--model.latent", "64", "--model.blendshapes", "12", "--evaluation.gap-frames", "1",
     "--evaluation.solver-frames", "12", "--evaluation.long-frames", "40",
-    "--evaluation.animation-frames", "6",
+    "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
+    "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
 
 
@@ -37,9 +38,15 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
             "penetration_percent",
             "edge_strain_p95",
             "jitter",
+            "swing_ratio",
+            "swing_correlation",
+            "wrinkle_ratio",
+            "rollout_error_mm",
         } <= set(report["evaluation"][stage])
     assert report["evaluation"]["lbs"]["energy_gap"] == pytest.approx(1.0)
     assert report["evaluation"]["psi"]["finite"] is True
+    assert 0 < report["evaluation"]["phi"]["span_gap"] and "span_gap" not in report["evaluation"]["psi"]
+    assert "penetration_by_joint" in report["motions"]["walk_3"]["lbs"]
     assert report["quickstart"]["train_seconds"] > 0
     assert report["quickstart"]["onnx_error_mm"] < 0.1
     assert "hold_gap" in (finished / "report.md").read_text()

@@ -181,7 +181,8 @@ def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
     assert abs(count - 300) < 30
     double = _of(whole, _two_pieces(small))
     _takes_a_step(double)
-    basis = scene.laplacian_basis(double.scene, 6, 5.0, 0.2, 1 / 30).reshape(6, -1)
+    config = dataclasses.replace(double.config, model=dataclasses.replace(double.config.model, blendshapes=6))
+    basis = blendshapes.laplacian(double.scene, config).reshape(6, -1)
     for piece in (slice(0, count), slice(count, None)):  # to move one of them alone is in the span of the basis
         alone = np.zeros((2 * count, 3), np.float32)
         alone[piece, 0] = 1.0
@@ -204,8 +205,10 @@ def test_every_scene_trains(whole, name):
 
 def test_the_basis_is_the_dense_solvers(whole):
     """Modes, and their scale, from the textbook's dense matrices."""
-    count, stiffness, density, timestep = 12, 5.0, 0.2, 1 / 30
-    basis = scene.laplacian_basis(whole.scene, count, stiffness, density, timestep)[::3, :, 0]
+    count, density, timestep = 12, whole.config.material.density, 1 / 30
+    stiffness = 0.25 * 4.7e-4 * (2 * whole.config.material.mu + whole.config.material.lam)
+    config = dataclasses.replace(whole.config, model=dataclasses.replace(whole.config.model, blendshapes=count))
+    basis = blendshapes.laplacian(whole.scene, config)[::3, :, 0]
     vertices = np.asarray(whole.garment.vertices, np.float64)
     matrix, mass = np.zeros((len(vertices),) * 2), np.zeros(len(vertices))
     for face in whole.garment.faces:

@@ -1,0 +1,78 @@
+"""Psi in training is Psi in use, and training it on the physics helps."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import small
+
+from clothjax import blendshapes, compact_latent, experiment, garment_model, inference, latent_predictor, stage1, tuning
+from clothjax import character as characters
+from clothjax import clips as motion
+from clothjax.config import Stage1Config
+from clothjax.latent_predictor import Normalizers, Scale
+from clothjax.types import ClothState, Pose
+
+SIZE = 9
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """An untrained Psi, and all it is made of."""
+    config = dataclasses.replace(small(), motions=("walk_0",))
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, latent=SIZE),
+        tuning=Stage1Config(steps=40, pool=2, learning_rate=3e-3, start_timestep=0.0, restart_probability=0.0),
+    )
+    whole = experiment.assemble(config)
+    reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
+    left, channels = compact_latent.latent_size(whole.scene, config.model)
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
+    constants = latent_predictor.constant_inputs(jnp.zeros(10), experiment.material(config), config.material)
+    garment = garment_model.init(
+        jax.random.key(0), left * channels, 0.1 * blendshapes.laplacian(whole.scene, config), config.model
+    )
+    predictor = latent_predictor.init(jax.random.key(1), left * channels, count, len(constants), config.stage2)
+    scales = [Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6)) for n in (left * channels, count)]
+    return whole, reel, kept, garment, predictor, Normalizers(*scales)
+
+
+def test_psi_in_training_is_psi_in_use(toy):
+    whole, _, kept, garment, predictor, normalizers = toy
+    config, betas = whole.config, jnp.linspace(-1, 1, 10)
+    model = inference.build(
+        config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=betas
+    )
+    clip = experiment.motion(whole, "walk_0")
+    pose = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(5)]
+    state = inference.initial_state(model, pose[0])
+    for t in range(3):
+        state, _ = inference.step(model, state, pose[t])
+    following, vertices = inference.step(model, state, pose[3])
+
+    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
+    animate = tuning.psi(garment, normalizers, kept)({"params": predictor}, whole.scene, character, config)
+    around = motion.poses(jax.tree.map(jnp.asarray, experiment.windows(clip)), 2)
+    window = characters.window(whole.scene, character, around)
+    cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), state.latent)
+    new, latent, seen = jax.jit(lambda c: animate(c, around, window, None, None))(cloth)
+    assert seen is None
+    np.testing.assert_allclose(latent, following.latent, atol=1e-5)
+    np.testing.assert_allclose(new + pose[2].translation[None], vertices, atol=2e-5)
+
+
+def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
+    whole, reel, kept, garment, predictor, normalizers = toy
+    config = tuning.settings(whole.config)
+    state = tuning.init(predictor, whole.scene, reel, whole.config)
+    assert jax.tree.structure(state.params) == jax.tree.structure(predictor) and not state.statistics
+    update = stage1.make_update(whole.scene, reel, config, 1, 40, animator=tuning.psi(garment, normalizers, kept))
+    state, metrics = update(state)
+    assert np.isfinite(metrics["loss"]).all() and int(state.step) == 40
+    # the same simulations once more, by the predictor that they have trained
+    _, again = update(tuning.init(state.params, whole.scene, reel, whole.config))
+    assert np.mean(again["loss"]) < 0.95 * np.mean(metrics["loss"])
