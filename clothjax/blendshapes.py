@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -38,7 +39,8 @@ def springs(scene: Scene, config: Config) -> Springs:
     ends = np.concatenate([edges, edges[:, ::-1]]).T
     joined = scipy.sparse.coo_array((np.full(2 * len(edges), stiffness), ends), shape=(count, count))
     laplacian = (scipy.sparse.diags_array(joined.sum(axis=1)) - joined).tocsc()[free][:, free]
-    areas = np.asarray(physics.vertex_areas(jnp.asarray(scene.garment.vertices), scene.garment.faces), np.float64)
+    with jax.ensure_compile_time_eval():
+        areas = np.asarray(physics.vertex_areas(jnp.asarray(scene.garment.vertices), scene.garment.faces), np.float64)
     return Springs(free, laplacian, cloth.density * areas[free], 1.0 / config.fps)
 
 

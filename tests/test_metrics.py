@@ -25,12 +25,18 @@ def walking():
 
 def test_gaps_are_ratios_of_summed_energies():
     steps = [
-        StepMeasure(energy=2.0, minimum=1.0, skinned=11.0, hold=3.0, error=np.array([1e-3, 3e-3]), converged=True),
-        StepMeasure(energy=1.5, minimum=1.0, skinned=31.0, hold=1.5, error=np.array([0.0, 0.0]), converged=False),
+        StepMeasure(
+            energy=2.0, minimum=1.0, skinned=11.0, hold=3.0, span=1.2, error=np.array([1e-3, 3e-3]), converged=True
+        ),
+        StepMeasure(
+            energy=1.5, minimum=1.0, skinned=31.0, hold=1.5, span=1.3, error=np.array([0.0, 0.0]), converged=False
+        ),
     ]
     gaps = metrics.gaps(steps)
     assert gaps["energy_gap"] == pytest.approx(1.5 / 40)
     assert gaps["hold_gap"] == pytest.approx(1.5 / 2.5)
+    assert gaps["span_gap"] == pytest.approx(0.5 / 2.5)
+    assert "span_gap" not in metrics.gaps([step._replace(span=np.nan) for step in steps])
     assert gaps["hold_gap_median"] == pytest.approx(0.75) and gaps["hold_gap_max"] == pytest.approx(1.0)
     assert gaps["step_error_mm"] == pytest.approx(1.0) and gaps["step_error_mm_max"] == pytest.approx(3.0)
     assert gaps["solver_converged"] == 0.5

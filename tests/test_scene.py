@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from toy import small
 
+from clothjax import blendshapes, clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
 from clothjax import character as characters
-from clothjax import clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
 from clothjax.export.onnx import check_onnx, to_onnx
 from clothjax.types import Garment, Motion, Pose
 from data_prep import garment as garments

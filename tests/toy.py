@@ -28,7 +28,7 @@ def shrink(config: Config) -> Config:
             descent_steps=2,
         ),
         shapes=dataclasses.replace(config.shapes, sequences=0),
-        stage1=dataclasses.replace(config.stage1, steps=40, pool=3, rollout_every=1000),
+        stage1=dataclasses.replace(config.stage1, steps=40, pool=3, rollout_every=1000, blendshape_rate=0.1),
         stage2=dataclasses.replace(config.stage2, steps=40, batch=4, rollout=2, hidden=(16,), sequences=2, frames=6),
         evaluation=dataclasses.replace(config.evaluation, gap_frames=1, solver_frames=12, long_frames=40),
     )
