@@ -193,6 +193,7 @@ def test_every_block_is_hoods(golden, shared):
                 p, nodes, body, {name: edges[name] for name in stack.edges},
                 {name: latents[rows] for name, latents in pair_latents.items()},
                 rows, graph, jnp.asarray(slots[rows]), jnp.asarray(active[rows]),
+                graph_network._mlp_tail,
             )  # fmt: skip
             edges |= updated
             pair_latents = {name: pair_latents[name].at[rows].set(latents) for name, latents in near.items()}

@@ -84,7 +84,9 @@ def _run(whole: Experiment, config: Config, character: Character, poses: Pose, s
     finite = bool(np.isfinite(trajectory).all())
     strain = metrics.edge_strain(whole.scene, character, last)["edge_strain_max"] if finite else np.inf
     inside = (
-        metrics.penetrations(whole.scene, whole.body, character.betas, last, _next(poses), [0])["penetration_percent"]
+        metrics.penetrations(whole.scene, whole.body, character.betas, last, _next(poses), [0], whole.names)[
+            "penetration_percent"
+        ]
         if finite
         else np.inf
     )
