@@ -118,8 +118,8 @@ def gaps(measures: list[StepMeasure]) -> dict[str, float]:
 
     energy_gap = (E - E_min) / (E_skinned - E_min): 0 the solver, 1 plain skinning. hold_gap puts E_hold in the place
     of E_skinned: 1 no dynamics at all; span_gap puts the minimum in the span of the blend shapes in the place of E
-    there. All means are ratios of summed energies, so that a frame whose garment
-    hardly moves does not outweigh the others; the medians are of single frames.
+    there. All means are ratios of summed energies, so that a frame whose garment hardly moves does not outweigh the
+    others; the medians are of single frames.
     """
     taken, minimum, skinned, hold = (
         np.array([getattr(m, name) for m in measures]) for name in ("energy", "minimum", "skinned", "hold")

@@ -15,6 +15,7 @@ from experiments import benchmark
 from experiments.benchmarks import scaling, scenes, stage1, timing
 
 
+@pytest.mark.slow
 def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     config = small()
     config = dataclasses.replace(  # what compiles soonest

@@ -183,7 +183,8 @@ def test_two_processes_train_and_save_as_one_with_two_devices(config):
     assert_same(trained(config.parent / "one"), trained(config.parent / "two"))
 
 
-@pytest.mark.parametrize("killed", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
 def test_one_killed_stops_the_other_which_says_how_to_go_on(config, killed):
     """In the second stage: the checkpoint of the first is there, and with it both can go on."""
     directory = config.parent / f"killed_{killed}"

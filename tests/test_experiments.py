@@ -142,6 +142,7 @@ def test_statistics_are_those_of_all_rows_counted():
         assert statistics.count == len(rows)
 
 
+@pytest.mark.slow
 def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
     """Its two-minute version, with the closed loops of a run that was hardly trained: they need not be good."""
     monkeypatch.setattr(stability.solver, "stress", lambda *_: {})  # has tests of its own
