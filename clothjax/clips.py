@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,6 +16,7 @@ class Clips(NamedTuple):
     rotations: Array  # [N, J, 3, 3]
     advance: Array  # [N, 3] m, translation of the next frame minus this one's; zero at a clip's end
     remaining: Array  # [N] int32, steps that can be taken from a frame before an unusable one
+    passed: Array  # [N] int32, the same backwards
     chance: Array  # [N] cumulative probability of starting at a frame
 
 
@@ -30,14 +32,16 @@ def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequenc
     Raises:
         ValueError: if no frame can be started from.
     """
-    rotations, advance, remaining = [], [], []
+    rotations, advance, remaining, passed = [], [], [], []
     for motion, wrong in zip(motions, bad):
         frames = len(motion.translation)
         usable = np.ones(frames, bool)
         usable[np.asarray(wrong, int)] = False
         inside = np.zeros(frames, bool)
         inside[1:-1] = usable[:-2] & usable[1:-1] & usable[2:]
-        left = np.zeros(frames + 1, np.int32)
+        left, behind = np.zeros(frames + 1, np.int32), np.zeros(frames + 1, np.int32)
+        for t in range(frames):
+            behind[t] = behind[t - 1] + 1 if inside[t] else 0
         for t in range(frames - 1, -1, -1):
             left[t] = left[t + 1] + 1 if inside[t] else 0
         rotations.append(np.asarray(motion.rotations, np.float32))
@@ -45,6 +49,7 @@ def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequenc
         step[:-1] = np.diff(np.asarray(motion.translation, np.float64), axis=0)
         advance.append(step.astype(np.float32))
         remaining.append(left[:frames])
+        passed.append(behind[:frames])
     weight = [(left >= shortest).astype(np.float64) for left in remaining]
     for family in set(families):
         members = [i for i, name in enumerate(families) if name == family]
@@ -60,6 +65,7 @@ def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequenc
         rotations=np.concatenate(rotations),
         advance=np.concatenate(advance),
         remaining=np.concatenate(remaining),
+        passed=np.concatenate(passed),
         chance=(chance / chance[-1]).astype(np.float32),
     )
 
@@ -75,6 +81,27 @@ def poses(clips: Clips, frame: Array) -> Pose:
     before = clips.advance[frame - 1]
     translation = jnp.stack([-before, jnp.zeros_like(before), clips.advance[frame]])
     return Pose(clips.rotations[frame + jnp.arange(-1, 2)], translation)
+
+
+def there_and_back(clips: Clips, frame: Array, count: int) -> Pose:
+    """Windows [count, 3, ...] as of `poses` from a frame on, played there and back where its clip ends sooner."""
+    # from the frame before the first that has a window to the one after the last
+    first, period = frame - clips.passed[frame], clips.passed[frame] + clips.remaining[frame]
+    along = jnp.abs((frame - first + jnp.arange(-1, count + 1)) % (2 * period) - period)
+    frames = first + period - along
+
+    def window(index):
+        before, now, after = frames[index], frames[index + 1], frames[index + 2]
+        back = _advance(clips, now, before)
+        translation = jnp.stack([back, jnp.zeros_like(back), _advance(clips, now, after)])
+        return Pose(clips.rotations[jnp.stack([before, now, after])], translation)
+
+    return jax.vmap(window)(jnp.arange(count))
+
+
+def _advance(clips: Clips, start: Array, end: Array) -> Array:
+    """The root's step [3] m between neighbouring frames."""
+    return jnp.where(end > start, clips.advance[start], -clips.advance[end])
 
 
 def standing(poses: Pose) -> Pose:

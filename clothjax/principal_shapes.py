@@ -85,7 +85,7 @@ def simulate(
             new = compact_latent.descend(precondition, now, garment, potential, settings.descent_steps, BOUND)
             return garment(new), state.latent, None
 
-        poses = jax.vmap(lambda t: motion.poses(clips, t))(simulation.frame + jnp.arange(settings.frames))
+        poses = motion.there_and_back(clips, simulation.frame, settings.frames)
         first = jax.tree.map(lambda x: x[0], poses)
         state = rollout.settle(animate, scene, character, first, config)
 

@@ -66,8 +66,7 @@ def teach(
     def sequence(key: Array, model: dict, clips: Clips):
         simulation = stage1.begin(key, scene, clips, config)
         character = stage1.wearer(scene, simulation.betas, simulation.material, config)
-        frames = simulation.frame + jnp.arange(stage.frames)
-        poses = jax.vmap(lambda t: motion.poses(clips, t))(frames)
+        poses = motion.there_and_back(clips, simulation.frame, stage.frames)
         _, _states, latents = rollout.play(model, scene, character, poses, config)
 
         def inputs(pose: Pose):

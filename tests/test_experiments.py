@@ -102,6 +102,23 @@ def test_every_family_is_started_from_equally_often_and_never_near_a_bad_frame()
         clips.concatenate([clip(100)], ["walk"], [np.zeros(0, int)], 100)
 
 
+def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
+    import jax
+
+    def clip(frames, first):
+        rotations = np.tile(np.eye(3), (frames, 1, 1, 1))
+        rotations[:, 0, 0, 0] = first + np.arange(frames)  # numbers them
+        return Motion(rotations, np.arange(frames)[:, None] ** 2 * [1.0, 0.0, 0.0], 30.0)
+
+    reel = clips.concatenate([clip(9, 0), clip(6, 100)], ["", ""], [np.array([8]), np.zeros(0, int)], 1)
+    poses = clips.there_and_back(jax.tree.map(np.asarray, reel), np.int32(5), 14)
+    seen = np.asarray(poses.rotations[..., 0, 0, 0])
+    assert seen[:, 1].tolist() == [5, 6, 7, 6, 5, 4, 3, 2, 1, 0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(seen[1:, 0], seen[:-1, 1])
+    np.testing.assert_array_equal(seen[1:, 1], seen[:-1, 2])
+    np.testing.assert_array_equal(poses.translation[..., 0], seen**2 - seen[:, 1:2] ** 2)
+
+
 def test_frame_rates_must_agree(tmp_path):
     config = Config(fps=60.0)
     whole = experiment.assemble(config)
