@@ -111,7 +111,7 @@ def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
         return Motion(rotations, np.arange(frames)[:, None] ** 2 * [1.0, 0.0, 0.0], 30.0)
 
     reel = clips.concatenate([clip(9, 0), clip(6, 100)], ["", ""], [np.array([8]), np.zeros(0, int)], 1)
-    poses = clips.there_and_back(jax.tree.map(np.asarray, reel), np.int32(5), 14)
+    poses = clips.there_and_back(jax.tree.map(jax.numpy.asarray, reel), 5, 14)
     seen = np.asarray(poses.rotations[..., 0, 0, 0])
     assert seen[:, 1].tolist() == [5, 6, 7, 6, 5, 4, 3, 2, 1, 0, 1, 2, 3, 4]
     np.testing.assert_array_equal(seen[1:, 0], seen[:-1, 1])
