@@ -15,7 +15,7 @@ from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Contact
 
 TYPE_EMBEDDING, LEVEL_EMBEDDING = 9, 4
-COLUMNS = 32  # of the Hessian at rest, computed together
+COLUMNS = 32  # of a Hessian, computed together
 MAX_LENGTH = 4.0  # of the step, where 1 is the configured cloth's at rest: others are softer or lighter
 
 
@@ -196,14 +196,25 @@ def descend(
     return latent
 
 
-def inverse_hessian(energy: Callable[[Array], Array], size: int, damping: float) -> Array:
-    """The inverse Hessian [L, L] in 1/J of an energy of codes [L], near zero; `damping` J is added to the Hessian."""
+def hessian(energy: Callable[[Array], Array], latent: Array) -> Array:
+    """The Hessian [L, L] in J of an energy of codes, at a code [L]."""
 
     def column(direction):
-        return jax.jvp(jax.grad(energy), (jnp.zeros(size),), (direction,))[1]
+        return jax.jvp(jax.grad(energy), (latent,), (direction,))[1]
 
     # some at a time: of a large garment all together would not fit into memory
-    values, vectors = jnp.linalg.eigh(jax.lax.map(column, jnp.eye(size), batch_size=COLUMNS))
+    return jax.lax.map(column, jnp.eye(len(latent)), batch_size=COLUMNS)
+
+
+def convex(matrix: Array) -> Array:
+    """A symmetric matrix [L, L] without its negative eigenvalues."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return jnp.matmul(vectors * jnp.maximum(values, 0.0)[None], vectors.T, precision="highest")
+
+
+def inverted(matrix: Array, damping: float) -> Array:
+    """The inverse of a convex Hessian [L, L] in J, with `damping` J added to its eigenvalues."""
+    values, vectors = jnp.linalg.eigh(matrix)
     inverse = 1.0 / (jnp.maximum(values, 0.0) + damping)
     return jnp.matmul(vectors * inverse[None], vectors.T, precision="highest")
 

@@ -157,8 +157,10 @@ class ModelConfig:
     steps down the potential of the garment that it decodes to."""
     descent_steps: int = 16
     """Conjugate-gradient steps of the guess."""
-    descent_damping: float = 0.1
-    """J, added to the Hessian of unit codes: folds are stiffer than the rest shape."""
+    descent_samples: int = 24
+    """Closed loops at whose ends the Hessian is taken whose mean preconditions the steps; 0: only that at rest."""
+    descent_damping: float = 0.02
+    """J, added to the Hessian of unit codes: folds are stiffer than its mean."""
     descent_bound: float = 0.3
     """Length in Z that a step cannot exceed."""
     decoder: tuple[int, ...] = (256, 256)

@@ -85,12 +85,15 @@ def _search_span(scene: Scene, character: Character, blendshapes: Array, config:
     """A function that brings a garment [V, 3] m into the span of blend shapes and down to the minimum there."""
     free = np.where(np.asarray(scene.garment.pinned), 0.0, 1.0)[:, None]
     shapes = (np.asarray(blendshapes, np.float64) * free).reshape(len(blendshapes), -1)
-    vectors = np.linalg.svd(shapes, full_matrices=False)[2].astype(np.float32)
+    _, sizes, vectors = np.linalg.svd(shapes, full_matrices=False)
+    vectors = vectors[sizes > 1e-6 * sizes[0]].astype(np.float32)
     size = len(vectors)
     rest = rollout.rest_energy(scene, config)
     inertia = float(jnp.mean(character.mass)) * config.fps**2
     inverse = jax.jit(
-        lambda: compact_latent.inverse_hessian(lambda w: rest((w @ vectors).reshape(-1, 3)), size, inertia)
+        lambda: compact_latent.inverted(
+            compact_latent.hessian(lambda w: rest((w @ vectors).reshape(-1, 3)), jnp.zeros(size)), inertia
+        )
     )()
 
     @jax.jit

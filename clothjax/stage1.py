@@ -147,6 +147,14 @@ def starting(
     )
 
 
+def preconditioned(state: TrainingState, inverse: Array) -> TrainingState:
+    """A state before the first step, with another preconditioner [L, L] of Phi's descent."""
+    return state._replace(
+        params=state.params | {"inverse_hessian": jnp.array(inverse)},
+        average=state.average | {"inverse_hessian": jnp.array(inverse)},
+    )
+
+
 def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
     """The inverse Hessian [L, L] in 1/J of `rollout.rest_energy` over codes near zero."""
     energy = rollout.rest_energy(scene, config)
@@ -156,7 +164,9 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
     def of_code(latent):
         return energy(garment_model.displacement(garment, latent, free, config.model))
 
-    return compact_latent.inverse_hessian(of_code, left * channels, config.model.descent_damping)
+    return compact_latent.inverted(
+        compact_latent.hessian(of_code, jnp.zeros(left * channels)), config.model.descent_damping
+    )
 
 
 class FirstStep(NamedTuple):

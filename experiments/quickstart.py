@@ -79,7 +79,7 @@ def readable(report: dict, config: Config) -> str:
 
 Garment {config.garment}, motion {", ".join(config.evaluation.motions)} (not trained on), betas of seed
 {config.evaluation.betas_seed} within {config.evaluation.betas} standard deviations. Training took
-{figures["train_seconds"]:.0f} s: blend shapes {figures["shapes_seconds"]:.0f} s, stage 1
+{figures["train_seconds"]:.0f} s: blend shapes and preconditioner {figures["start_seconds"]:.0f} s, stage 1
 {figures["stage1_seconds"]:.0f} s, the teacher's rollouts {figures["teacher_seconds"]:.0f} s, stage 2
 {figures["stage2_seconds"]:.0f} s, compilation {figures["compile_seconds"]:.0f} s.
 

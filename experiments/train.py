@@ -27,6 +27,7 @@ from clothjax import (
     experiment,
     fit,
     latent_predictor,
+    preconditioner,
     principal_shapes,
     stage1,
     stage2,
@@ -71,16 +72,23 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     kept = configuration.to_dict(config)
 
     began, shapes = time.monotonic(), None
-    if config.shapes.sequences > 0 and not checkpoint.steps(directory / "stage1" / "checkpoints"):
+    new = not checkpoint.steps(directory / "stage1" / "checkpoints")
+    if new and config.shapes.sequences > 0:
         devices.say(f"blend shapes: from {config.shapes.sequences} closed loops of cloth that the physics moves")
         with progress("simulating", config.shapes.sequences) as report:
             shapes = principal_shapes.principal(whole.scene, reel, config, report, device_mesh)
-    shapes_seconds = time.monotonic() - began
+    state = stage1.init(whole.scene, reel, config, shapes)
+    if new and config.model.latent_update == "descent" and config.model.descent_samples > 0:
+        model = {"params": state.params, "statistics": state.statistics}
+        with progress("preconditioning", config.model.descent_samples) as report:
+            inverse = preconditioner.measure(model, whole.scene, reel, config, report, device_mesh)
+        state = stage1.preconditioned(state, inverse)
+    start_seconds = time.monotonic() - began
 
     devices.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     first = fit.fit(
         stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, device_mesh),
-        devices.replicate(stage1.init(whole.scene, reel, config, shapes), device_mesh),
+        devices.replicate(state, device_mesh),
         steps=config.stage1.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage1",
@@ -107,7 +115,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         may_differ=("directory", "evaluation", "tuning"),
     )
     clock = {
-        "shapes_seconds": shapes_seconds,
+        "start_seconds": start_seconds,
         "stage1_seconds": first.seconds,
         "stage2_seconds": second.seconds,
         "teacher_seconds": seconds,

@@ -28,7 +28,11 @@ def coded():
     def potential(positions):
         return jnp.sum((positions - goal) ** 2)
 
-    return compact_latent.inverse_hessian(lambda z: potential(decode(z)), 3, 1e-9), decode, potential
+    return (
+        compact_latent.inverted(compact_latent.hessian(lambda z: potential(decode(z)), jnp.zeros(3)), 1e-9),
+        decode,
+        potential,
+    )
 
 
 def test_one_step_reaches_the_minimum_of_a_quadratic(coded):

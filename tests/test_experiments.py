@@ -16,7 +16,8 @@ TOY = [
     "--model.latent", "64", "--model.blendshapes", "12", "--evaluation.gap-frames", "1",
     "--evaluation.solver-frames", "12", "--evaluation.long-frames", "40",
     "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
-    "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--tuning.steps", "20", "--tuning.pool", "4",
+    "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
+    "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
 
 

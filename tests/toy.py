@@ -26,6 +26,7 @@ def shrink(config: Config) -> Config:
             decoder=(8,),
             blendshapes=9,
             descent_steps=2,
+            descent_samples=0,
         ),
         shapes=dataclasses.replace(config.shapes, sequences=0),
         stage1=dataclasses.replace(config.stage1, steps=40, pool=3, rollout_every=1000, blendshape_rate=0.1),

@@ -1,0 +1,68 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import small
+
+from clothjax import clips as motion
+from clothjax import experiment, losses, preconditioner, rollout, stage1
+from clothjax.config import Range
+
+
+@pytest.mark.slow
+def test_the_descent_goes_further_with_the_hessian_of_cloth_that_is_worn():
+    config = small()
+    config = dataclasses.replace(
+        config,
+        motions=("walk_0",),
+        model=dataclasses.replace(config.model, descent_samples=8, descent_steps=6, latent=128, blendshapes=100),
+    )
+    whole = experiment.assemble(config)
+    scene = whole.scene
+    reel, _ = experiment.training_clips(whole)
+    state = stage1.init(scene, reel, config)
+    model = {"params": state.params, "statistics": state.statistics}
+    inverse = preconditioner.measure(model, scene, reel, config)
+    assert inverse.shape == state.params["inverse_hessian"].shape
+    np.testing.assert_allclose(inverse, inverse.T, atol=1e-4 * np.abs(inverse).max())
+    values = np.linalg.eigvalsh(inverse.astype(np.float64))
+    assert 0 < values.min() and values.max() <= 1.001 / config.model.descent_damping
+
+    reel = jax.tree.map(jnp.asarray, reel)
+
+    @jax.jit
+    def energies(key, params):
+        """After a step from the end of a loop of the first parameters, taken with the others."""
+        simulation = stage1.begin(key, scene, reel, config)
+        character = stage1.wearer(scene, simulation.betas, simulation.material, config)
+        poses = motion.there_and_back(reel, simulation.frame, 10)
+        _, states, _ = rollout.play(model, scene, character, poses, config)
+        cloth, window = jax.tree.map(lambda x: x[-1], (states, poses))
+        animate = rollout.phi({"params": params, "statistics": state.statistics}, scene, character, config)
+        _, (new, step, _) = rollout.take(animate, scene, character, cloth, window, 1 / config.fps, config)
+        return losses.potential(new, step, scene.mesh, config.physics)
+
+    keys = jax.random.split(jax.random.key(9), 6)
+    at_rest, worn = (
+        np.array([energies(key, params) for key in keys])
+        for params in (state.params, stage1.preconditioned(state, inverse).params)
+    )
+    print(worn, at_rest)
+    assert np.mean(np.log(worn / at_rest)) < 0
+
+
+def test_loops_that_all_blow_up_are_reported():
+    config = small()
+    config = dataclasses.replace(
+        config,
+        motions=("walk_0",),
+        model=dataclasses.replace(config.model, descent_samples=1),
+        material=dataclasses.replace(config.material, mu_range=Range(1e30, 1e30)),
+    )
+    whole = experiment.assemble(config)
+    reel, _ = experiment.training_clips(whole)
+    state = stage1.init(whole.scene, reel, config)
+    with pytest.raises(ValueError, match="no closed loop of an untrained Phi stayed finite"):
+        preconditioner.measure({"params": state.params, "statistics": state.statistics}, whole.scene, reel, config)
