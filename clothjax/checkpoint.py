@@ -55,15 +55,15 @@ def save(directory: str | Path, step: int, state: Any, config: dict, description
     existing = steps(directory)
     if existing and existing[-1] >= step:
         raise ValueError(f"{directory}: cannot save step {step}, there is already a checkpoint of step {existing[-1]}")
-    named = {name: jnp.asarray(leaf) for name, leaf in _named(state).items()}
+    arrays = {name: jnp.asarray(leaf) for name, leaf in named(state).items()}
     about = {
         "format": FORMAT,
         "step": step,
         "config": config,
         "description": description,
-        "leaves": {name: _describe(leaf) for name, leaf in named.items()},
+        "leaves": {name: _describe(leaf) for name, leaf in arrays.items()},
     }
-    arrays = {name: _plain(leaf) for name, leaf in named.items() if leaf.size}  # Orbax cannot store empty arrays
+    arrays = {name: _plain(leaf) for name, leaf in arrays.items() if leaf.size}  # Orbax cannot store empty arrays
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
     )
@@ -136,20 +136,20 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
         empty = [part for part in parts if not like[part]]
         if empty:
             raise ValueError(f"{path}: has no {', '.join(empty)}; it is of another kind of training")
-        like = _lists(like)
-        leaves = _leaves(about, _named(like))
+        like = lists(like)
+        leaves = _leaves(about, named(like))
         return jax.tree.unflatten(jax.tree.structure(like), leaves.values()), about
 
     return _newest(Path(directory).resolve(), None, read_one)
 
 
-def _lists(tree: Any) -> Any:
+def lists(tree: Any) -> Any:
     """Dictionaries with the keys 0, 1, 2, ... as lists."""
     if not isinstance(tree, dict):
         return tree
     if tree.keys() == {str(i) for i in range(len(tree))}:  # not where an element without leaves left a gap
-        return [_lists(tree[str(i)]) for i in range(len(tree))]
-    return {key: _lists(value) for key, value in tree.items()}
+        return [lists(tree[str(i)]) for i in range(len(tree))]
+    return {key: lists(value) for key, value in tree.items()}
 
 
 def set_aside(directory: str | Path, after: int) -> None:
@@ -162,12 +162,12 @@ def set_aside(directory: str | Path, after: int) -> None:
             (directory / str(step)).rename(aside)
 
 
-def _named(tree: Any) -> dict[str, Any]:
+def named(tree: Any) -> dict[str, Any]:
     """Leaves by path. Dictionary keys and fields of a NamedTuple look alike: parts of either can be named."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-    assert len(named) == len(leaves), "two leaves of the state have the same path"
-    return named
+    by_name = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    assert len(by_name) == len(leaves), "two leaves of the state have the same path"
+    return by_name
 
 
 def _is_key(leaf: Any) -> bool:
@@ -221,7 +221,7 @@ def _about(path: Path) -> Checkpoint:
 
 
 def _restore(directory: Path, like: Tree, step: int | None, *, whole: bool) -> tuple[Tree, Checkpoint]:
-    wanted = _named(like)
+    wanted = named(like)
 
     def read(path: Path) -> tuple[Tree, Checkpoint]:
         checkpoint = _about(path)

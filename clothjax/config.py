@@ -277,12 +277,16 @@ class EvaluationConfig:
     motions: tuple[str, ...] = ("walk_3",)
     betas_seed: int = 12345
     betas: float = 1.5  # standard deviations
+    frames: int = 300
+    """Of each motion, at the most."""
     gap_frames: int = 10
     """Frames at which the reference solver is asked."""
     solver_frames: int = 60
     """Frames of the reference solver's own closed loop, for jitter and pictures."""
     long_frames: int = 1000
     """Frames of the closed-loop test, the motion repeated."""
+    wearers: bool = False
+    """Measures nine wearers too: a thin, the mean and a heavy body in soft, middling and stiff cloth."""
     animation_frames: int = 120
     """Frames of animations, at the most."""
 

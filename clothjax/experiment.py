@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import clips, plausibility, scene, storage
+from clothjax import clips, plausibility, scene, skinning, storage
 from clothjax.clips import Clips
 from clothjax.config import Config
 from clothjax.scene import Scene
@@ -86,6 +86,34 @@ def material(config: Config) -> Material:
     """The configured material."""
     cloth = config.material
     return Material(*(jnp.float32(value) for value in (cloth.density, cloth.mu, cloth.lam, cloth.bending)))
+
+
+def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
+    """Betas [S] and material of a thin, the mean and a heavy body in soft, middling and stiff cloth.
+
+    Thin and heavy are `evaluation.betas` standard deviations along the direction in which the body's volume grows most.
+    """
+    body, cloth = experiment.body, experiment.config.material
+    count = body.shapedirs.shape[-1]
+
+    def volume(betas):
+        corners = np.asarray(skinning.shaped_vertices(body, jnp.asarray(betas, jnp.float32)), np.float64)[body.faces]
+        return np.linalg.det(corners).sum() / 6
+
+    growth = np.array([volume(unit) - volume(-unit) for unit in np.eye(count)])
+    heavy = experiment.config.evaluation.betas * growth / np.linalg.norm(growth)
+    bodies = {"thin": -heavy, "mean": 0 * heavy, "heavy": heavy}
+    ranges = (cloth.mu_range, cloth.lam_range, cloth.bending_range)
+    middle = [np.sqrt(r.low * r.high) if r.log else 0.5 * (r.low + r.high) for r in ranges]
+    materials = {"soft": [r.low for r in ranges], "middling": middle, "stiff": [r.high for r in ranges]}
+    return {
+        f"{shape}, {name}": (
+            betas.astype(np.float32),
+            Material(*(jnp.float32(value) for value in (cloth.density, *values))),
+        )
+        for shape, betas in bodies.items()
+        for name, values in materials.items()
+    }
 
 
 def betas(config: Config) -> np.ndarray:

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import checkpoint, configuration, garment_model, latent_predictor, skinning, storage
+from clothjax import garment_model, latent_predictor, skinning, storage, trained
 from clothjax.config import Config
-from clothjax.latent_predictor import Normalizers, Scale
+from clothjax.latent_predictor import Normalizers
 from clothjax.types import Array, Body, Garment, Material, Motion, Pose
 
 FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
@@ -86,30 +86,27 @@ def build(
 
 
 def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
-    """The model of a finished run: the folder that holds `stage2`, and `tuning` where Psi was tuned.
+    """The model of a finished run, or a garment that comes with the library.
 
     Args:
+        run: the folder of a run or of a packed model, or a name of `trained.shipped()`, as "skirt".
         betas: [S] body shape; default the mean body.
         material: default the configured one.
 
     Raises:
         ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
     """
-    directory = Path(run) / "stage2" / "checkpoints"
-    parts, about = checkpoint.read(directory, "average", "normalizers", "garment")
-    config = configuration.from_dict(Config, about.config, str(directory))
-    predictor, tuned = parts["average"], Path(run) / "tuning" / "checkpoints"
-    if checkpoint.steps(tuned):
-        predictor = checkpoint.read(tuned, "average")[0]["average"]
+    run = trained.folder(str(run)) if str(run) in trained.shipped() else run
+    config, garment, predictor, normalizers = trained.psi(run)
     body = storage.load_body(config.body)
     return build(
         config,
         storage.load_garment(config.garment, body),
         body,
         storage.joint_names(config.body),
-        parts["garment"],
+        garment,
         predictor,
-        Normalizers(*(Scale(**parts["normalizers"][name]) for name in Normalizers._fields)),
+        normalizers,
         betas=betas,
         material=material,
     )

@@ -69,6 +69,15 @@ def write_seconds(directory: Path, seconds: float, compile_seconds: float, step:
     _replace(directory / "training.json", json.dumps(record) + "\n")
 
 
+def add_seconds(directory: Path, **spent: float) -> dict[str, float]:
+    """Adds to the seconds that parts of a run took in all its sessions, kept in `clock.json`; returns these."""
+    path = directory / "clock.json"
+    total = json.loads(path.read_text()) if path.exists() else {}
+    total |= {name: total.get(name, 0.0) + seconds for name, seconds in spent.items()}
+    _replace(path, json.dumps(total) + "\n")
+    return total
+
+
 def _replace(path: Path, text: str) -> None:
     """Writes a file whole or not at all."""
     partial = path.with_name(path.name + ".partial")

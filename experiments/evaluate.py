@@ -1,7 +1,8 @@
-"""Measures a run against the reference solver, in closed loop on motions it was not trained on.
+"""Measures a run, or garments that come with the library, against the reference solver, in closed loop.
 
     python -m experiments.evaluate runs/quickstart
     python -m experiments.evaluate runs/quickstart --motion walk_3 dance.motion.h5 --json report.json
+    python -m experiments.evaluate --pretrained all --json report.json
 
 Three stages are measured: `lbs` (plain skinning), `phi` (stage 1) and `psi` (stage 2). No state is borrowed from the
 solver: every number is about the stage's own trajectory, with the configured material and the betas of
@@ -19,14 +20,19 @@ solver: every number is about the stage's own trajectory, with the configured ma
     swing_ratio, swing_correlation            of the velocity of what skinning does not do, beside the solver's in its
                     own closed loop: 1 is as lively; `rollout_error_mm` is the distance to it, `wrinkle_ratio` the rms
                     dihedral angle over its.
-    edge_strain_p95, edge_strain_max          of |l / l_0 - 1|.
+    edge_strain_p95, edge_strain_max          of |l / l_0 - 1|; `edge_strain_ratio`, the first over the solver's.
     jitter          rms of the second time difference of vertex accelerations, over the solver's own in closed loop.
     psi_phi_mm      mean vertex distance of Psi to Phi, over the first motion played there and back for
-                    `evaluation.long_frames` frames of closed loop, from frame 5 on; `_last100` its last hundred.
+                    `evaluation.long_frames` frames of closed loop, from frame 5 on; `_last100` its last hundred,
+                    `_slope` the line fitted to it, in mm per 1 000 frames.
     finite          no value of that long run was not finite.
     ms_per_frame    of the jitted closed loop, on this machine.
 
-Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penetration at every fourth frame.
+Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penetration at every fourth frame. With
+`evaluation.wearers` the gaps of nine other wearers on the first motion stand under `wearers`.
+
+With `--pretrained` the report has the means over garments under `mean`, and the report of each under its name. Of the
+validation motions those are used that are there: motion capture does not come with the library.
 """
 
 import argparse
@@ -41,32 +47,63 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import character as characters
-from clothjax import clips, experiment, inference, metrics, rollout, simulation
+from clothjax import clips, experiment, inference, metrics, rollout, simulation, storage, trained
 from clothjax.character import Character
 from clothjax.experiment import Experiment
 from clothjax.types import Motion, Pose
 from experiments.session import fail_clearly, progress, setup
 from experiments.train import load_phi
 
+STAGES = ("lbs", "phi", "psi")
+WEARERS_FRAMES, WEARERS_GAPS = 90, 4  # of the closed loop of each wearer, and where the solver is asked
 SETTLING = 5  # frames left out of averages over time: the start is a skinned garment
 
 
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("run", type=Path, nargs="?", help="folder of a finished run")
+    parser.add_argument("--pretrained", nargs="+", default=None, help="names of shipped garments, or all")
     parser.add_argument("--motion", nargs="+", default=None, help="asset names or paths; default: the configured ones")
     parser.add_argument("--json", type=Path, default=None, help="default: RUN/evaluation.json")
     arguments = parser.parse_args(argv)
-    report = evaluate(arguments.run, arguments.motion)
-    path = arguments.json or arguments.run / "evaluation.json"
+    if (arguments.run is None) == (arguments.pretrained is None):
+        raise ValueError("give the folder of a run, or --pretrained with names of garments or `all`")
+    if arguments.pretrained is None:
+        report = evaluate(arguments.run, arguments.motion)
+        print(table(report["evaluation"]))
+    else:
+        names = trained.shipped() if arguments.pretrained == ["all"] else tuple(arguments.pretrained)
+        report = pretrained({name: trained.folder(name) for name in names}, arguments.motion)
+        print(table(report["mean"]))
+    path = arguments.json or (arguments.run or Path(".")) / "evaluation.json"
     path.write_text(json.dumps(report, indent=1) + "\n")
-    print(table(report))
     print(f"written to {path}")
+
+
+def pretrained(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
+    """The report of each garment under its name, and under `mean` the means of its stages over garments."""
+    reports = {}
+    for name, folder in folders.items():
+        there = motions
+        if there is None:
+            wanted = trained.phi(folder)[0].evaluation.motions
+            there = [motion for motion in wanted if storage.asset(motion).is_file()]
+            print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
+        reports[name] = evaluate(folder, there)
+    stages = [{**report, **report.pop("evaluation")} for report in reports.values()]
+    mean = {stage: _mean([each[stage] for each in stages]) for stage in STAGES}
+    return {"mean": mean} | dict(zip(reports, stages))
+
+
+def kept(run: Path) -> Path:
+    """The folder for the trajectories that are measured: the run's own, or one for a garment of the library."""
+    return Path("runs") / "pretrained" / run.name if trained.packed(run) else run
 
 
 def evaluate(run: Path, motions: list[str] | None = None) -> dict:
     """All measures, under `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`."""
     whole, phi = load_phi(run)
+    kept(run).mkdir(parents=True, exist_ok=True)
     config = whole.config
     betas = experiment.betas(config)
     psi = inference.load(run, betas=betas)
@@ -74,33 +111,44 @@ def evaluate(run: Path, motions: list[str] | None = None) -> dict:
         jnp.asarray(betas), experiment.material(config)
     )
     names = list(motions or config.evaluation.motions)
-    each = {}
+    if not names:
+        raise ValueError(f"{run}: none of its validation motions is here; name others with --motion")
+    play = jax.jit(lambda m, c, p: rollout.play(m, whole.scene, c, p, config)[1].position)
+    each, wearers = {}, {}
     with progress("evaluating", 4 * len(names) + 1) as report:
         for index, name in enumerate(names):
             clip = experiment.motion(whole, name)
+            clip = Motion(
+                clip.rotations[: config.evaluation.frames], clip.translation[: config.evaluation.frames], clip.fps
+            )
             done = partial(lambda base, n: report(base + n), 4 * index)
-            each[Path(name).stem] = _motion(whole, phi, psi, character, betas, clip, done, run, Path(name).stem)
-        long_phi, long_psi = _long(whole, phi, psi, character, experiment.motion(whole, names[0]))
+            path = kept(run) / f"trajectories_{Path(name).stem}.npz"
+            each[Path(name).stem] = _motion(whole, play, phi, psi, character, betas, clip, done, path)
+        first = experiment.motion(whole, names[0])
+        long_phi, long_psi = _long(play, whole, phi, psi, character, first)
+        if config.evaluation.wearers:
+            wearers = _wearers(whole, play, phi, run, first)
         report(4 * len(names) + 1)
-    summary = {stage: _mean([one[stage] for one in each.values()]) for stage in ("lbs", "phi", "psi")}
+    summary = {stage: _mean([one[stage] for one in each.values()]) for stage in STAGES}
     summary["phi"] |= long_phi
     summary["psi"] |= long_psi
     return {
         "evaluation": summary,
         "motions": each,
+        "wearers": wearers,
         "betas": betas.tolist(),
         "gap_frames": config.evaluation.gap_frames,
         "garment": config.garment,
     }
 
 
-def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Motion, done, run: Path, name: str):
+def _motion(whole: Experiment, play, phi, psi, character: Character, betas, clip: Motion, done, path: Path) -> dict:
     """Measures of the three stages on one clip; keeps its trajectories for pictures."""
     config = whole.config
     poses = windows(clip)
     frames = poses.translation.shape[0]
     tracks = {"lbs": skinned_trajectory(whole, character, poses)}
-    tracks["phi"] = phi_trajectory(whole, phi, character, poses)
+    tracks["phi"] = np.asarray(play(phi, character, poses))
     tracks["psi"] = psi_trajectory(psi, clip)
     done(1)
     solved, infos = simulation.simulate(
@@ -114,7 +162,8 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
     count = len(solved)
     rough = metrics.roughness(solved[SETTLING:], advance[SETTLING : count - 1])
     sampled = np.unique(np.linspace(SETTLING, frames - 2, config.evaluation.gap_frames).astype(int))
-    result = {"solver": {"frames": count, "converged": float(np.mean([info.converged for info in infos]))}}
+    strain = metrics.edge_strain(whole.scene, character, solved[SETTLING:])
+    result = {"solver": {"frames": count, "converged": float(np.mean([info.converged for info in infos])), **strain}}
     for stage, track in tracks.items():
         measured = metrics.gaps(
             metrics.step_measures(
@@ -132,26 +181,44 @@ def _motion(whole: Experiment, phi, psi, character: Character, betas, clip: Moti
                 whole.scene, whole.body, jnp.asarray(betas), track, poses, range(SETTLING, frames, 4), whole.names
             )
         measured |= metrics.edge_strain(whole.scene, character, track[SETTLING:])
+        measured["edge_strain_ratio"] = measured["edge_strain_p95"] / strain["edge_strain_p95"]
         measured |= metrics.beside_solver(whole.scene, *(x[SETTLING:count] for x in (track, solved, tracks["lbs"])))
         measured["jitter"] = metrics.roughness(track[SETTLING:count], advance[SETTLING : count - 1]) / rough
         result[stage] = measured
     done(4)
     np.savez_compressed(
-        run / f"trajectories_{name}.npz",
+        path,
         **{k: np.asarray(v, np.float32) for k, v in tracks.items()},
         solver=solved,
     )
     return result
 
 
-def _long(whole: Experiment, phi, psi, character: Character, clip: Motion) -> tuple[dict, dict]:
+def _wearers(whole: Experiment, play, phi, run: Path, clip: Motion) -> dict[str, dict]:
+    """Gaps of Phi and Psi on nine wearers, over the start of a clip."""
+    config = whole.config
+    clip = Motion(clip.rotations[:WEARERS_FRAMES], clip.translation[:WEARERS_FRAMES], clip.fps)
+    poses = windows(clip)
+    sampled = np.linspace(SETTLING, len(clip.translation) - 4, WEARERS_GAPS).astype(int)
+    result = {}
+    for name, (betas, material) in experiment.wearers(whole).items():
+        character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(betas, material)
+        psi = inference.load(run, betas=betas, material=material)
+        tracks = {"phi": np.asarray(play(phi, character, poses)), "psi": psi_trajectory(psi, clip)}
+        result[name] = {
+            stage: metrics.gaps(metrics.step_measures(whole.scene, character, track, poses, sampled, config))
+            for stage, track in tracks.items()
+        }
+    return result
+
+
+def _long(play, whole: Experiment, phi, psi, character: Character, clip: Motion) -> tuple[dict, dict]:
     """Phi, and Psi against Phi, over the long closed loop, with the time of both."""
     clip = experiment.there_and_back(clip, whole.config.evaluation.long_frames + 2)
     poses = windows(clip)
-    play = jax.jit(lambda m, p: rollout.play(m, whole.scene, character, p, whole.config)[1].position)
-    play = play.lower(phi, poses).compile()
+    play = play.lower(phi, character, poses).compile()
     started = time.perf_counter()
-    one = np.asarray(play(phi, poses))
+    one = np.asarray(play(phi, character, poses))
     phi_seconds = time.perf_counter() - started
     other = psi_trajectory(psi, clip)  # compiles
     started = time.perf_counter()
@@ -162,6 +229,7 @@ def _long(whole: Experiment, phi, psi, character: Character, clip: Motion) -> tu
         "psi_phi_mm": float(apart[SETTLING:].mean()),
         "psi_phi_mm_max": float(apart[SETTLING:].max()),
         "psi_phi_mm_last100": float(apart[-100:].mean()),
+        "psi_phi_mm_slope": 1e3 * float(np.polyfit(np.arange(len(apart) - SETTLING), apart[SETTLING:], 1)[0]),
         "finite": bool(np.isfinite(other).all()),
         "ms_per_frame": 1e3 * seconds / len(other),
     }
@@ -198,12 +266,11 @@ def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
     return np.asarray(vertices) - np.asarray(local.translation)[:, None]
 
 
-def table(report: dict) -> str:
-    """The report for a reader, as Markdown."""
+def table(stages: dict) -> str:
+    """The measures of the three stages for a reader, as Markdown."""
     rows = ["| | lbs | phi | psi |", "|---|---|---|---|"]
-    stages = report["evaluation"]
-    for name in dict.fromkeys(key for stage in ("lbs", "phi", "psi") for key in stages[stage]):
-        cells = (_cell(stages[stage].get(name)) for stage in ("lbs", "phi", "psi"))
+    for name in dict.fromkeys(key for stage in STAGES for key in stages[stage]):
+        cells = (_cell(stages[stage].get(name)) for stage in STAGES)
         rows.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(rows)
 
@@ -215,9 +282,11 @@ def _cell(value) -> str:
 def _mean(results: list[dict[str, float]]) -> dict[str, float]:
     # a maximum over motions stays a maximum
     return {
-        key: float((np.max if "max" in key else np.mean)([result[key] for result in results]))
+        key: all(r[key] for r in results)
+        if isinstance(value, bool)
+        else float((np.max if "max" in key else np.mean)([r[key] for r in results]))
         for key, value in results[0].items()
-        if isinstance(value, float)
+        if isinstance(value, bool | float)
     }
 
 

@@ -67,7 +67,7 @@ def main(argv: list[str]) -> None:
     }  # fmt: skip
     (directory / "report.json").write_text(json.dumps(report, indent=1) + "\n")
     (directory / "report.md").write_text(readable(report, config))
-    print(table(report))
+    print(table(report["evaluation"]))
     print(f"ONNX Runtime differs from jax by {1e3 * onnx_error:.4f} mm at most over {len(part.rotations)} frames")
     print(f"look at {directory / 'comparison.png'} and {directory / 'walk.webp'}; figures in {directory / 'report.md'}")
 
@@ -87,7 +87,7 @@ What the rows mean is in the docstring of `experiments/evaluate.py`. Gaps are ov
 frames of each motion; 0 is the reference solver, 1 plain skinning (`energy_gap`) or a garment that keeps its last
 canonical displacement (`hold_gap`).
 
-{table(report)}
+{table(report["evaluation"])}
 
 ONNX Runtime against jax over {figures["onnx_frames"]} frames: {figures["onnx_error_mm"]:.4f} mm at most.
 """

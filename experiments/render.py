@@ -3,6 +3,7 @@
     python -m experiments.render runs/quickstart --motion walk_3 --out walk.webp
     python -m experiments.render runs/quickstart --motion dance_0 --out dance.glb
     python -m experiments.render runs/quickstart --motion walk_3 --out comparison.png
+    python -m experiments.render --pretrained skirt --motion dance_3 --out skirt.webp
 
 .webp is an animation of Psi on the body, .glb the same for a viewer; .png compares skinning, Phi, Psi and the
 reference solver on a clip that `experiments.evaluate` has measured.
@@ -16,12 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import animation, experiment, inference, skinning
+from clothjax import animation, experiment, inference, skinning, trained
 from clothjax.animation import SKIN, Surface
 from clothjax.experiment import Experiment
 from clothjax.export import gltf
 from clothjax.types import Motion, Pose
-from experiments.evaluate import psi_trajectory
+from experiments.evaluate import kept, psi_trajectory
 from experiments.session import fail_clearly, progress, setup
 from experiments.train import load_phi
 
@@ -31,7 +32,8 @@ SIZE = (360, 480)
 
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("run", type=Path, nargs="?", help="folder of a finished run")
+    parser.add_argument("--pretrained", default=None, help="name of a garment that comes with the library")
     parser.add_argument("--motion", default=None, help="asset name or path; default: the configured one")
     parser.add_argument("--out", type=Path, required=True, help="a .webp, .glb or .png")
     parser.add_argument("--frames", type=int, default=None, help="at the most; default: the configured number")
@@ -39,10 +41,13 @@ def main(argv: list[str]) -> None:
     writers = {".webp": write_webp, ".glb": write_glb, ".png": write_comparison}
     if arguments.out.suffix not in writers:
         raise ValueError(f"{arguments.out}: cannot write {arguments.out.suffix!r}; allowed: {', '.join(writers)}")
-    whole, _ = load_phi(arguments.run)
+    if (arguments.run is None) == (arguments.pretrained is None):
+        raise ValueError("give the folder of a run, or --pretrained with the name of a garment")
+    run = arguments.run or trained.folder(arguments.pretrained)
+    whole, _ = load_phi(run)
     motion = arguments.motion or whole.config.evaluation.motions[0]
     frames = arguments.frames or whole.config.evaluation.animation_frames
-    writers[arguments.out.suffix](arguments.run, whole, motion, arguments.out, frames)
+    writers[arguments.out.suffix](run, whole, motion, arguments.out, frames)
     print(f"written to {arguments.out}")
 
 
@@ -74,10 +79,10 @@ def write_glb(run: Path, whole: Experiment, motion: str, out: Path, frames: int)
 
 def write_comparison(run: Path, whole: Experiment, motion: str, out: Path, frames: int = 0) -> None:
     """Skinning, Phi, Psi and the reference solver at the same moments of a measured clip."""
-    kept = run / f"trajectories_{Path(motion).stem}.npz"
-    if not kept.is_file():
-        raise ValueError(f"{kept}: no such file; run `python -m experiments.evaluate {run} --motion {motion}` first")
-    with np.load(kept) as tracks:
+    path = kept(run) / f"trajectories_{Path(motion).stem}.npz"
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; run `python -m experiments.evaluate {run} --motion {motion}` first")
+    with np.load(path) as tracks:
         tracks = {name: tracks[name] for name in ROWS}
     clip = experiment.motion(whole, motion)
     body, root = body_trajectory(whole, clip)

@@ -29,12 +29,13 @@ from clothjax import (
     latent_predictor,
     preconditioner,
     principal_shapes,
+    run_folder,
     stage1,
     stage2,
+    trained,
     tuning,
 )
 from clothjax.config import Config
-from clothjax.features import Statistics
 from experiments.session import fail_clearly, progress, setup
 
 STEPS_PER_CALL = 20
@@ -83,7 +84,8 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         with progress("preconditioning", config.model.descent_samples) as report:
             inverse = preconditioner.measure(model, whole.scene, reel, config, report, device_mesh)
         state = stage1.preconditioned(state, inverse)
-    start_seconds = time.monotonic() - began
+    if new:
+        _spent(directory, start_seconds=time.monotonic() - began)
 
     devices.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     first = fit.fit(
@@ -115,10 +117,9 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         may_differ=("directory", "evaluation", "tuning"),
     )
     clock = {
-        "start_seconds": start_seconds,
+        **_spent(directory, teacher_seconds=seconds),
         "stage1_seconds": first.seconds,
         "stage2_seconds": second.seconds,
-        "teacher_seconds": seconds,
         "compile_seconds": first.compile_seconds + second.compile_seconds,
     }
     if config.tuning.steps == 0:
@@ -140,17 +141,22 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     return clock | {"tuning_seconds": third.seconds}
 
 
+def _spent(directory: Path, **seconds: float) -> dict[str, float]:
+    """Keeps the time of what is not training, in the run's folder."""
+    if jax.process_index() > 0:
+        return seconds
+    directory.mkdir(parents=True, exist_ok=True)
+    return run_folder.add_seconds(directory, **seconds)
+
+
 # stage 1 does not read these, so a run may change them and go on
 DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning")
 
 
 def load_phi(directory: Path) -> tuple[experiment.Experiment, dict]:
-    """Phi of a run: its experiment, and averaged `params` with `statistics`."""
-    checkpoints = Path(directory) / "stage1" / "checkpoints"
-    parts, about = checkpoint.read(checkpoints, "average", "statistics")
-    config = configuration.from_dict(Config, about.config, str(checkpoints))
-    statistics = {name: Statistics(**values) for name, values in parts["statistics"].items()}
-    return experiment.assemble(config), {"params": parts["average"], "statistics": statistics}
+    """Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`."""
+    config, model = trained.phi(directory)
+    return experiment.assemble(config), model
 
 
 if __name__ == "__main__":

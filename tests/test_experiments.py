@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clothjax import clips, experiment, features, scene
+from clothjax import checkpoint, clips, experiment, features, inference, metrics, scene, trained
 from clothjax.config import Config
 from clothjax.types import Motion
 from experiments import evaluate, quickstart, render, stability, train
@@ -72,6 +72,61 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys):
     assert Image.open(finished / "t.webp").n_frames == 3
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
+
+
+def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(trained, "MODELS", tmp_path)
+    size = trained.pack(finished, tmp_path / "toy")
+    assert trained.shipped() == ("toy",) and size == (tmp_path / "toy" / "model.npz").stat().st_size < 500_000
+    config, model = trained.phi(finished)
+    config_packed, model_packed = trained.phi(tmp_path / "toy")
+    assert config_packed == config
+    for (name, one), other in zip(
+        checkpoint.named(model).items(), checkpoint.named(model_packed).values(), strict=True
+    ):
+        assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
+    whole = experiment.assemble(config)
+    clip = experiment.motion(whole, "walk_3")
+    one, other = (evaluate.psi_trajectory(inference.load(which), clip)[:20] for which in (finished, "toy"))
+    assert 0 < metrics.distance_mm(one, other).max() < 1.0
+    with pytest.raises(ValueError, match="no garment called 'coat' comes with clothjax; there are: toy"):
+        render.main(["--pretrained", "coat", "--out", "x.png"])
+    whole_file = (tmp_path / "toy" / "model.npz").read_bytes()
+    for damaged in (whole_file[: size // 2], b"", whole_file[: size // 2] + b"?" + whole_file[size // 2 + 1 :]):
+        (tmp_path / "toy" / "model.npz").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"model\.npz: not a whole packed model"):
+            inference.load("toy")
+
+
+def test_the_report_of_several_garments(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate.trained, "phi", lambda _: (Config(), {}))
+    figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
+
+    def measured(folder, motions):
+        assert motions == ["walk_3"]
+        gap, most, finite = figures[folder.name]
+        stage = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
+        return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), stage), "motions": {}}
+
+    monkeypatch.setattr(evaluate, "evaluate", measured)
+    report = evaluate.pretrained({name: tmp_path / name for name in figures})
+    assert report["mean"]["psi"] == {"energy_gap": 0.2, "penetration_max_mm": 2.0, "finite": False}
+    assert report["dress"]["phi"]["energy_gap"] == 0.3 and report["skirt"]["motions"] == {}
+
+
+def test_wearers_are_thin_and_heavy_soft_and_stiff():
+    whole = experiment.assemble(Config())
+    wearers = experiment.wearers(whole)
+    assert len(wearers) == 9
+
+    def waist(betas):
+        vertices = np.asarray(whole.body.vertices + np.asarray(whole.body.shapedirs) @ betas)
+        return np.ptp(vertices, axis=0)[2]
+
+    thin, mean, heavy = (waist(wearers[f"{shape}, soft"][0]) for shape in ("thin", "mean", "heavy"))
+    assert thin < mean < heavy
+    soft, middling, stiff = (wearers[f"mean, {cloth}"][1] for cloth in ("soft", "middling", "stiff"))
+    assert soft.mu < middling.mu < stiff.mu and soft.bending < middling.bending < stiff.bending
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):

@@ -1,0 +1,136 @@
+"""What training left: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
+
+A packed model is a folder with `model.npz` and `config.yaml`. Large matrices are kept in eight bits with a scale for
+each column (`NAME` and `NAME|scale`), the blend shapes and the preconditioner in half precision, all else as it is.
+"""
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from clothjax import checkpoint, configuration, storage
+from clothjax.config import Config
+from clothjax.features import Statistics
+from clothjax.latent_predictor import Normalizers, Scale
+
+MODELS = storage.ASSETS / "models"
+WEIGHTS, CONFIG = "model.npz", "config.yaml"
+HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
+LARGE = 2000  # entries of a matrix that is worth eight bits
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the garments that come with the library."""
+    return tuple(sorted(path.parent.name for path in MODELS.glob(f"*/{WEIGHTS}")))
+
+
+def folder(name: str) -> Path:
+    """Where a garment that comes with the library is.
+
+    Raises:
+        ValueError: for a name that is none.
+    """
+    if name not in shipped():
+        raise ValueError(f"no garment called {name!r} comes with clothjax; there are: {', '.join(shipped()) or 'none'}")
+    return MODELS / name
+
+
+def phi(run: str | Path) -> tuple[Config, dict]:
+    """The configuration and Phi's `params` and `statistics`, of a run or a packed model.
+
+    Raises:
+        ValueError: if there is no readable one.
+    """
+    if packed(run):
+        config, parts = _unpack(Path(run))
+        params, statistics = parts["phi"], parts["statistics"]
+    else:
+        directory = Path(run) / "stage1" / "checkpoints"
+        parts, about = checkpoint.read(directory, "average", "statistics")
+        config = configuration.from_dict(Config, about.config, str(directory))
+        params, statistics = parts["average"], parts["statistics"]
+    return config, {"params": params, "statistics": {name: Statistics(**each) for name, each in statistics.items()}}
+
+
+def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
+    """The configuration, the decoder with its blend shapes, the predictor (the tuned one where there is one) and its
+    normalizers, of a run or a packed model.
+
+    Raises:
+        ValueError: if there is no readable one.
+    """
+    if packed(run):
+        config, parts = _unpack(Path(run))
+        garment, predictor = parts["phi"]["garment"], parts["predictor"]
+    else:
+        directory, tuned = (Path(run) / stage / "checkpoints" for stage in ("stage2", "tuning"))
+        parts, about = checkpoint.read(directory, "average", "normalizers", "garment")
+        config = configuration.from_dict(Config, about.config, str(directory))
+        garment, predictor = parts["garment"], parts["average"]
+        if checkpoint.steps(tuned):
+            predictor = checkpoint.read(tuned, "average")[0]["average"]
+    normalizers = Normalizers(*(Scale(**parts["normalizers"][name]) for name in Normalizers._fields))
+    return config, garment, predictor, normalizers
+
+
+def packed(run: str | Path) -> bool:
+    """Whether a folder is a packed model."""
+    return (Path(run) / WEIGHTS).is_file()
+
+
+def pack(run: str | Path, out: str | Path) -> int:
+    """Writes a finished run as a packed model; returns the bytes of its weights."""
+    config, model = phi(run)
+    _, garment, predictor, normalizers = psi(run)
+    for name, leaf in checkpoint.named(garment).items():
+        np.testing.assert_array_equal(leaf, checkpoint.named(model["params"]["garment"])[name])
+    parts = {
+        "phi": model["params"],
+        "statistics": {name: each._asdict() for name, each in model["statistics"].items()},
+        "predictor": predictor,
+        "normalizers": {name: each._asdict() for name, each in normalizers._asdict().items()},
+    }
+    arrays = {}
+    for name, leaf in checkpoint.named(parts).items():
+        leaf = np.asarray(leaf)
+        if name in HALVED:
+            leaf = leaf.astype(np.float16)
+        elif leaf.ndim > 1 and leaf.size > LARGE:
+            scale = np.maximum(np.abs(leaf).max(axis=tuple(range(leaf.ndim - 1))) / 127, 1e-20).astype(np.float32)
+            arrays[f"{name}|scale"] = scale
+            leaf = np.round(leaf / scale).astype(np.int8)
+        arrays[name] = leaf
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(out / WEIGHTS, **arrays)
+    (out / CONFIG).write_text(yaml.safe_dump(configuration.to_dict(config), sort_keys=False))
+    return (out / WEIGHTS).stat().st_size
+
+
+def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
+    config = configuration.load(Config, directory / CONFIG)
+    path = directory / WEIGHTS
+    tree: dict = {}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            for name in file.files:
+                if name.endswith("|scale"):
+                    continue
+                leaf = file[name]
+                if leaf.dtype == np.int8:
+                    leaf = leaf * file[f"{name}|scale"]
+                *above, last = name.split("/")
+                node = tree
+                for key in above:
+                    node = node.setdefault(key, {})
+                node[last] = leaf.astype(np.float32)
+        parts = checkpoint.lists(tree)
+        return config, {name: parts[name] for name in ("phi", "statistics", "predictor", "normalizers")}
+    except (ValueError, KeyError, OSError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(
+            f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"
+        ) from error

@@ -1,0 +1,44 @@
+"""Packs a finished run as a garment that comes with the library, with what was measured of it.
+
+    python -m experiments.ship runs/skirt skirt
+
+It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
+the validation motions, with the command that trained it and its hours.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from clothjax import trained
+from clothjax.run_folder import add_seconds, read_seconds
+from experiments.evaluate import pretrained, table
+from experiments.session import fail_clearly, setup
+
+
+def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("name", help="of the garment")
+    arguments = parser.parse_args(argv)
+    folder = trained.MODELS / arguments.name
+    size = trained.pack(arguments.run, folder)
+    print(f"{folder}: {size / 1e6:.2f} MB of weights")
+    report = pretrained({arguments.name: folder})[arguments.name]
+    config, _ = trained.phi(folder)
+    seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in ("stage1", "stage2", "tuning"))
+    seconds += sum(add_seconds(arguments.run).values())
+    about = {
+        "command": f"python -m experiments.train configs/protocol.yaml --garment {config.garment}",
+        "seed": config.stage1.seed,
+        "hours": seconds / 3600,
+    }
+    (folder / "report.json").write_text(json.dumps(about | report, indent=1) + "\n")
+    print(table(report))
+
+
+if __name__ == "__main__":
+    setup()
+    with fail_clearly():
+        main(sys.argv[1:])
