@@ -20,8 +20,8 @@ from clothjax.types import ClothState, Pose
 
 
 def settings(config: Config) -> Config:
-    """The configuration with that of the tuning in the place of stage 1's."""
-    return dataclasses.replace(config, stage1=config.tuning)
+    """The configuration with that of the tuning in the place of stage 1's, for the same bodies."""
+    return dataclasses.replace(config, stage1=dataclasses.replace(config.tuning, betas=config.stage1.betas))
 
 
 def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.TrainingState:
