@@ -242,6 +242,15 @@ class Stage1Config:
 
 
 @dataclass(frozen=True)
+class TuningConfig(Stage1Config):
+    """Training of Psi on the physics, after its regression: like stage 1, with Psi in the place of Phi, on its bodies."""
+
+    steps: int = 0
+    learning_rate: float = 1e-4
+    start_timestep: float = 0.0
+
+
+@dataclass(frozen=True)
 class Stage2Config:
     """Training of the latent predictor on the frozen teacher (21)."""
 
@@ -307,8 +316,7 @@ class Config:
     shapes: ShapesConfig = field(default_factory=ShapesConfig)
     stage1: Stage1Config = field(default_factory=Stage1Config)
     stage2: Stage2Config = field(default_factory=Stage2Config)
-    tuning: Stage1Config = Stage1Config(steps=0, learning_rate=1e-4, start_timestep=0.0)
-    """Training of Psi on the physics, after its regression: like stage 1, with Psi in the place of Phi."""
+    tuning: TuningConfig = field(default_factory=TuningConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     directory: str = ""
     """Where the run is kept; empty: runs/<name of the config file>."""
