@@ -11,7 +11,7 @@ from toy import small
 from clothjax import blendshapes, compact_latent, experiment, garment_model, inference, latent_predictor, stage1, tuning
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax.config import Stage1Config
+from clothjax.config import TuningConfig
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import ClothState, Pose
 
@@ -25,7 +25,7 @@ def toy():
     config = dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, latent=SIZE),
-        tuning=Stage1Config(steps=40, pool=2, learning_rate=3e-3, start_timestep=0.0, restart_probability=0.0),
+        tuning=TuningConfig(steps=40, pool=2, learning_rate=3e-3, restart_probability=0.0),
     )
     whole = experiment.assemble(config)
     reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
