@@ -83,11 +83,16 @@ def packed(run: str | Path) -> bool:
 
 
 def pack(run: str | Path, out: str | Path) -> int:
-    """Writes a finished run as a packed model; returns the bytes of its weights."""
+    """Writes a finished run as a packed model; returns the bytes of its weights.
+
+    Raises:
+        ValueError: if the run is not finished, or Psi was trained on another Phi than the run now has.
+    """
     config, model = phi(run)
     _, garment, predictor, normalizers = psi(run)
-    for name, leaf in checkpoint.named(garment).items():
-        np.testing.assert_array_equal(leaf, checkpoint.named(model["params"]["garment"])[name])
+    decoder = checkpoint.named(model["params"]["garment"])
+    if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(garment).items()):
+        raise ValueError(f"{run}: stage 1 was trained further after stage 2: train stage 2 again")
     parts = {
         "phi": model["params"],
         "statistics": {name: each._asdict() for name, each in model["statistics"].items()},
