@@ -243,7 +243,7 @@ class Stage1Config:
 
 @dataclass(frozen=True)
 class TuningConfig(Stage1Config):
-    """Training of Psi on the physics, after its regression: like stage 1, with Psi in the place of Phi, on its bodies."""
+    """Training of Psi on the physics after its regression: as stage 1, with Psi in the place of Phi, on its bodies."""
 
     steps: int = 0
     learning_rate: float = 1e-4

@@ -42,6 +42,39 @@ class TrainingState(NamedTuple):
     garment: dict  # the frozen decoder and blend shapes: with them, a checkpoint is a whole Psi
 
 
+def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
+    """A function of a key, Phi (`params` and `statistics`) and clips: one rollout on a random clip, body and material.
+
+    Args:
+        kept: joints that are inputs.
+    """
+    stage = config.stage2
+
+    def sequence(key: Array, model: dict, clips: Clips) -> Teacher:
+        simulation = stage1.begin(key, scene, clips, config)
+        character = stage1.wearer(scene, simulation.betas, simulation.material, config)
+        poses = motion.there_and_back(clips, simulation.frame, stage.frames)
+        _, _states, latents = rollout.play(model, scene, character, poses, config)
+
+        def inputs(pose: Pose):
+            return latent_predictor.pose_inputs(
+                pose.rotations[::-1], jnp.stack([pose.translation[2], -pose.translation[0]]),
+                character.joints, scene.body.parents, kept, config.fps,
+            )  # fmt: skip
+
+        constants = latent_predictor.constant_inputs(simulation.betas, simulation.material, config.material)
+        first = jnp.zeros_like(latents[:1])
+        return Teacher(jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants)
+
+    return sequence
+
+
+def blank(model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> Teacher:
+    """A rollout of zeros: all that is needed of a teacher to read a training that is finished."""
+    shapes = jax.eval_shape(make_rollout(scene, kept, config), jax.random.key(0), model, clips)
+    return jax.tree.map(lambda part: np.zeros((1, *part.shape), part.dtype), shapes)
+
+
 def teach(
     model: dict,
     scene: Scene,
@@ -60,28 +93,9 @@ def teach(
         device_mesh: each device rolls out a part of the sequences.
     """
     stage = config.stage2
-    fps = config.fps
     began = time.monotonic()
-
-    def sequence(key: Array, model: dict, clips: Clips):
-        simulation = stage1.begin(key, scene, clips, config)
-        character = stage1.wearer(scene, simulation.betas, simulation.material, config)
-        poses = motion.there_and_back(clips, simulation.frame, stage.frames)
-        _, _states, latents = rollout.play(model, scene, character, poses, config)
-
-        def inputs(pose: Pose):
-            return latent_predictor.pose_inputs(
-                pose.rotations[::-1], jnp.stack([pose.translation[2], -pose.translation[0]]),
-                character.joints, scene.body.parents, kept, fps,
-            )  # fmt: skip
-
-        constants = latent_predictor.constant_inputs(simulation.betas, simulation.material, config.material)
-        first = jnp.zeros_like(latents[:1])
-        return jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants
-
-    teacher = Teacher(
-        *sampling.sample(sequence, (model, clips), stage.sequences, stage.seed + 1, progress, device_mesh)
-    )
+    sequence = make_rollout(scene, kept, config)
+    teacher = sampling.sample(sequence, (model, clips), stage.sequences, stage.seed + 1, progress, device_mesh)
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
         raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")

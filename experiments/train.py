@@ -104,8 +104,11 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     devices.say(
         f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi"
     )
-    with progress("rolling out the teacher", config.stage2.sequences) as report:
-        teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
+    if checkpoint.steps(directory / "stage2" / "checkpoints")[-1:] == [config.stage2.steps]:
+        teacher, seconds = stage2.blank(model, whole.scene, reel, joints, config), 0.0
+    else:
+        with progress("rolling out the teacher", config.stage2.sequences) as report:
+            teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
     second = fit.fit(
         stage2.make_update(teacher, config, STEPS_PER_CALL, device_mesh),
         devices.replicate(stage2.init(teacher, jax.device_get(first.state.average["garment"]), config), device_mesh),
