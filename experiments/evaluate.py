@@ -82,6 +82,8 @@ def main(argv: list[str]) -> None:
 
 def pretrained(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
     """The report of each garment under its name, and under `mean` the means of its stages over garments."""
+    if not folders:
+        raise ValueError("no garments come with this clothjax; pack some with experiments.ship")
     reports = {}
     for name, folder in folders.items():
         there = motions
