@@ -20,6 +20,7 @@ from clothjax.latent_predictor import Normalizers, Scale
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG = "model.npz", "config.yaml"
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
+UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 LARGE = 2000  # entries of a matrix that is worth eight bits
 
 
@@ -135,7 +136,7 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
                 node[last] = leaf.astype(np.float32)
         parts = checkpoint.lists(tree)
         return config, {name: parts[name] for name in ("phi", "statistics", "predictor", "normalizers")}
-    except (ValueError, KeyError, OSError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+    except UNREADABLE as error:
         raise ValueError(
             f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"
         ) from error
