@@ -93,7 +93,7 @@ def test_phi_does_not_see_place_or_heading(toy, update):
     turned = motion._replace(translation=motion.translation @ turn.T)
     heading, _ = _play(whole, reel, model, turned, turn)
     # the root joint, about which the body turns, is not at the origin; later the cloth has amplified the rounding
-    np.testing.assert_allclose((heading - root)[:12], ((plain - root) @ turn.T)[:12], atol=2e-4)
+    np.testing.assert_allclose((heading - root)[:8], ((plain - root) @ turn.T)[:8], atol=5e-5)
 
 
 def _untrained(whole, reel):
