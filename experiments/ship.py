@@ -30,7 +30,8 @@ def main(argv: list[str]) -> None:
     seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in ("stage1", "stage2", "tuning"))
     seconds += sum(add_seconds(arguments.run).values())
     about = {
-        "command": f"python -m experiments.train configs/protocol.yaml --garment {config.garment}",
+        # the configuration is whole: it trains the same again
+        "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
         "seed": config.stage1.seed,
         "hours": seconds / 3600,
     }

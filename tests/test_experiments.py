@@ -39,6 +39,7 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
             "step_error_mm",
             "penetration_percent",
             "edge_strain_p95",
+            "edge_strain_ratio",
             "jitter",
             "swing_ratio",
             "swing_correlation",
@@ -47,6 +48,7 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
         } <= set(report["evaluation"][stage])
     assert report["evaluation"]["lbs"]["energy_gap"] == pytest.approx(1.0)
     assert report["evaluation"]["psi"]["finite"] is True
+    assert np.isfinite(report["evaluation"]["psi"]["psi_phi_mm_slope"])
     assert 0 < report["evaluation"]["phi"]["span_gap"] and "span_gap" not in report["evaluation"]["psi"]
     assert "penetration_by_joint" in report["motions"]["walk_3"]["lbs"]
     assert report["quickstart"]["train_seconds"] > 0
