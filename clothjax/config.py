@@ -246,8 +246,12 @@ class TuningConfig(Stage1Config):
     """Training of Psi on the physics after its regression: as stage 1, with Psi in the place of Phi, on its bodies."""
 
     steps: int = 0
+    pool: int = 192
     learning_rate: float = 1e-4
     start_timestep: float = 0.0
+    preconditioning: float = 0.5
+    """Power of Phi's inverse Hessian that gradients of codes are multiplied by; 0: none. The cloth is up to 4 000 times
+    stiffer along some codes than along others. With 1, errors of all would count alike, which energies do not."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from clothjax.losses import TimeStep
 from clothjax.rollout import Animator
 from clothjax.scene import Scene
 from clothjax.stage1 import MakeAnimator
-from clothjax.types import ClothState, Pose
+from clothjax.types import Array, ClothState, Pose
 
 
 def settings(config: Config) -> Config:
@@ -31,8 +31,36 @@ def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.
     return stage1.starting(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
 
 
-def psi(garment: dict, normalizers: Normalizers, kept: np.ndarray) -> MakeAnimator:
-    """Psi, of `params`, as what moves a character's garment: with a frozen decoder, on the joints `kept`."""
+@jax.custom_vjp
+def precondition(matrix: Array, code: Array) -> Array:
+    """The same code [L], whose gradient is multiplied by a symmetric matrix [L, L]."""
+    return code
+
+
+precondition.defvjp(lambda matrix, code: (code, matrix), lambda matrix, g: (jnp.zeros_like(matrix), matrix @ g))
+
+
+def preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: float) -> Array:
+    """The matrix [L, L] for gradients of normalised codes: an inverse Hessian to a power, without its scale.
+
+    Args:
+        inverse: [L, L] in 1/J, of codes as they are.
+    """
+    deviation = np.asarray(normalizers.latent.deviation, np.float64)
+    values, vectors = np.linalg.eigh(np.asarray(inverse, np.float64) / np.outer(deviation, deviation))
+    values = np.maximum(values, 1e-12 * values[-1]) ** power
+    return jnp.asarray((vectors * values / np.sqrt(np.mean(values**2))) @ vectors.T, jnp.float32)
+
+
+def psi(
+    garment: dict, normalizers: Normalizers, kept: np.ndarray, inverse: np.ndarray | None = None, power: float = 0.0
+) -> MakeAnimator:
+    """Psi, of `params`, as what moves a character's garment: with a frozen decoder, on the joints `kept`.
+
+    Args:
+        inverse: the inverse Hessian [L, L] of Phi's descent, whose `power` preconditions the gradients of codes.
+    """
+    matrix = None if inverse is None or power == 0 else preconditioner(inverse, normalizers, power)
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
         constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
@@ -49,6 +77,8 @@ def psi(garment: dict, normalizers: Normalizers, kept: np.ndarray) -> MakeAnimat
                 constants,
                 config.stage2.latent_decay,
             )
+            if matrix is not None:
+                latent = precondition(matrix, latent)
             latent = latent_predictor.denormalise(normalizers.latent, latent)
             new = compact_latent.decode({"garment": garment}, scene, character, latent, window, config.model)
             return new, latent, None

@@ -129,7 +129,13 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         return clock
 
     devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    psi = tuning.psi(second.state.garment, second.state.normalizers, joints)
+    psi = tuning.psi(
+        second.state.garment,
+        second.state.normalizers,
+        joints,
+        model["params"].get("inverse_hessian"),
+        config.tuning.preconditioning,
+    )
     third = fit.fit(
         stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
         devices.replicate(tuning.init(second.state.average, whole.scene, reel, config), device_mesh),

@@ -76,3 +76,28 @@ def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
     # the same simulations once more, by the predictor that they have trained
     _, again = update(tuning.init(state.params, whole.scene, reel, whole.config))
     assert np.mean(again["loss"]) < 0.95 * np.mean(metrics["loss"])
+
+
+def test_preconditioned_gradients_point_to_the_minimum():
+    rng = np.random.default_rng(0)
+    basis, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    stiffness = (basis * np.geomspace(1e-2, 1e2, 6)) @ basis.T  # J
+    deviation = rng.uniform(0.5, 2.0, 6)
+    scale = Scale(jnp.zeros(6), jnp.asarray(deviation, jnp.float32), -jnp.ones(6), jnp.ones(6))
+    code, best = jnp.asarray(rng.normal(size=6), jnp.float32), jnp.asarray(rng.normal(size=6), jnp.float32)
+
+    def energy(code, matrix=None):
+        code = code if matrix is None else tuning.precondition(matrix, code)
+        apart = (code - best) * scale.deviation
+        return 0.5 * apart @ jnp.asarray(stiffness, jnp.float32) @ apart
+
+    def alignment(power):
+        matrix = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), power)
+        assert energy(code, matrix) == energy(code)
+        gradient, way = jax.grad(energy)(code, matrix), code - best
+        return float(gradient @ way / jnp.linalg.norm(gradient) / jnp.linalg.norm(way))
+
+    assert alignment(1.0) > 0.999
+    assert alignment(0.0) < alignment(0.5) < alignment(1.0)
+    plain = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
+    np.testing.assert_allclose(plain, np.eye(6), atol=1e-5)
