@@ -63,7 +63,7 @@ def write_webp(run: Path, whole: Experiment, motion: str, out: Path, frames: int
         for t in range(len(garment)):
             # the camera goes along, but does not bob
             height = np.array([0.0, root[t, 1], 0.0])
-            surfaces = _dressed(whole, body[t] + height, garment[t] + height)
+            surfaces = dressed(whole, body[t] + height, garment[t] + height)
             pictures.append(animation.render(surfaces, camera, SIZE, floor=floor))
             report(t + 1)
     animation.webp(out, pictures, clip.fps)
@@ -91,7 +91,7 @@ def write_comparison(run: Path, whole: Experiment, motion: str, out: Path, frame
     camera = animation.camera_for(body[moments])
     rows = {
         label: [
-            animation.render(_dressed(whole, body[t], tracks[name][t]), camera, SIZE, floor=floor - float(root[t, 1]))
+            animation.render(dressed(whole, body[t], tracks[name][t]), camera, SIZE, floor=floor - float(root[t, 1]))
             for t in moments
         ]
         for name, label in ROWS.items()
@@ -99,9 +99,13 @@ def write_comparison(run: Path, whole: Experiment, motion: str, out: Path, frame
     animation.comparison(out, rows, [f"frame {t + 1}" for t in moments])
 
 
-def body_trajectory(whole: Experiment, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """The whole body [T - 2, B, 3] m at the frames that are measured, relative to its root [T - 2, 3] m."""
-    betas = jnp.asarray(experiment.betas(whole.config))
+def body_trajectory(whole: Experiment, clip: Motion, betas: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The whole body [T - 2, B, 3] m at the frames that are measured, relative to its root [T - 2, 3] m.
+
+    Args:
+        betas: [S]; default: those of evaluation.
+    """
+    betas = jnp.asarray(experiment.betas(whole.config) if betas is None else betas)
     vertices = skinning.shaped_vertices(whole.body, betas)
     joints = skinning.shaped_joints(whole.body, betas)
 
@@ -114,7 +118,8 @@ def body_trajectory(whole: Experiment, clip: Motion) -> tuple[np.ndarray, np.nda
     return np.stack([np.asarray(posed(r)) for r in rotations]), translation - translation[0]
 
 
-def _dressed(whole: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
+def dressed(whole: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
+    """The surfaces of a garment on a body, or of the garment alone where the scene has no body."""
     cloth = [Surface(garment, whole.garment.faces)]
     return [Surface(body, whole.body.faces, SKIN), *cloth] if whole.scene.touchable else cloth
 

@@ -8,7 +8,7 @@ from PIL import Image
 from clothjax import checkpoint, clips, experiment, features, inference, metrics, scene, trained
 from clothjax.config import Config
 from clothjax.types import Motion
-from experiments import evaluate, quickstart, render, stability, train
+from experiments import evaluate, gallery, quickstart, render, stability, train
 from experiments.stress import closed_loop
 
 TOY = [
@@ -75,6 +75,10 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys):
     assert Image.open(finished / "t.webp").n_frames == 3
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
+    picture = finished / "bodies.png"
+    gallery.main([str(finished), "--motions", "twist_3", "--frame", "1", "--out", str(picture)])
+    width, height = Image.open(picture).size
+    assert width > 3 * gallery.SIZE[0] and height > 3 * gallery.SIZE[1]  # three bodies; three methods
 
 
 def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
