@@ -9,7 +9,7 @@ import numpy as np
 from clothjax import features, rotation, skinning
 from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.graph_network import Params, init_mlp, mlp
-from clothjax.types import Array, Material
+from clothjax.types import Array, Material, Pose
 
 SLACK = 0.02  # m/s, m or of a rotation matrix: what an input may be out of its range without being worth a word
 
@@ -57,6 +57,12 @@ def pose_inputs(
     _, positions = jax.vmap(lambda turns: skinning.forward_kinematics(turns, joints, parents))(local)
     relative = positions[:, kept[1:]] - positions[:, None, root]
     return jnp.concatenate([velocity.reshape(-1), codes.reshape(-1), relative.reshape(-1)])
+
+
+def window_inputs(poses: Pose, joints: Array, parents: np.ndarray, kept: np.ndarray, fps: float) -> Array:
+    """`pose_inputs` of a window of three poses, as `clips.poses` gives it."""
+    advance = jnp.stack([poses.translation[2], -poses.translation[0]])
+    return pose_inputs(poses.rotations[::-1], advance, joints, parents, kept, fps)
 
 
 def constant_inputs(betas: Array, material: Material, config: MaterialConfig) -> Array:

@@ -12,13 +12,15 @@ import optax
 from jax.sharding import Mesh
 
 from clothjax import clips as motion
-from clothjax import devices, fit, garment_model, latent_predictor, rollout, sampling, stage1
+from clothjax import devices, fit, garment_model, latent_predictor, rollout, sampling, skinning, stage1
 from clothjax.clips import Clips
 from clothjax.config import Config, ModelConfig
 from clothjax.fit import Weights
 from clothjax.latent_predictor import Normalizers
 from clothjax.scene import Scene
 from clothjax.types import Array, Pose
+
+ORDINARY = 10_000  # random frames that tell which pose inputs are ordinary
 
 
 class Teacher(NamedTuple):
@@ -56,11 +58,8 @@ def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
         poses = motion.there_and_back(clips, simulation.frame, stage.frames)
         _, _states, latents = rollout.play(model, scene, character, poses, config)
 
-        def inputs(pose: Pose):
-            return latent_predictor.pose_inputs(
-                pose.rotations[::-1], jnp.stack([pose.translation[2], -pose.translation[0]]),
-                character.joints, scene.body.parents, kept, config.fps,
-            )  # fmt: skip
+        def inputs(poses: Pose):
+            return latent_predictor.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
 
         constants = latent_predictor.constant_inputs(simulation.betas, simulation.material, config.material)
         first = jnp.zeros_like(latents[:1])
@@ -102,10 +101,32 @@ def teach(
     return Teacher(*(part[good] for part in teacher)), time.monotonic() - began
 
 
-def init(teacher: Teacher, garment: dict, config: Config) -> TrainingState:
-    """The state before the first step, its normalizers measured on the teacher's rollouts."""
+def ordinary_poses(scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> np.ndarray:
+    """Inputs [n, P] of random frames and bodies of training, of which the teacher's few rollouts hold only a part."""
+    clips = jax.tree.map(jnp.asarray, clips)
+
+    def one(key):
+        keys = jax.random.split(key)
+        limit = config.stage1.betas
+        betas = jax.random.uniform(keys[0], (scene.body.shapedirs.shape[-1],), minval=-limit, maxval=limit)
+        poses = motion.poses(clips, motion.draw(clips, jax.random.uniform(keys[1])))
+        joints = skinning.shaped_joints(scene.body, betas)
+        return latent_predictor.window_inputs(poses, joints, scene.body.parents, kept, config.fps)
+
+    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(config.stage2.seed), ORDINARY)))
+
+
+def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray | None = None) -> TrainingState:
+    """The state before the first step, its normalizers measured on the teacher's rollouts.
+
+    Args:
+        ordinary: more inputs [n, P], as of `ordinary_poses`.
+    """
     key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
     size = teacher.latents.shape[-1]
+    poses = np.asarray(teacher.poses).reshape(-1, teacher.poses.shape[-1])
+    if ordinary is not None:
+        poses = np.concatenate([poses, ordinary])
     params = latent_predictor.init(model_key, size, teacher.poses.shape[-1], teacher.constants.shape[-1], config.stage2)
     return TrainingState(
         step=jnp.int32(0),
@@ -117,7 +138,7 @@ def init(teacher: Teacher, garment: dict, config: Config) -> TrainingState:
         garment=jax.tree.map(jnp.array, garment),
         normalizers=Normalizers(
             latent=latent_predictor.measure(teacher.latents[:, 1:].reshape(-1, size)),
-            pose=latent_predictor.measure(teacher.poses.reshape(-1, teacher.poses.shape[-1])),
+            pose=latent_predictor.measure(poses),
         ),
     )
 

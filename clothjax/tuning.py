@@ -66,10 +66,7 @@ def psi(
         constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
 
         def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, _potential: Callable):
-            advance = jnp.stack([poses.translation[2], -poses.translation[0]])
-            inputs = latent_predictor.pose_inputs(
-                poses.rotations[::-1], advance, character.joints, scene.body.parents, kept, config.fps
-            )
+            inputs = latent_predictor.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
             latent = latent_predictor.predict(
                 model["params"],
                 latent_predictor.normalise(normalizers.latent, state.latent),

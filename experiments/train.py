@@ -109,9 +109,11 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     else:
         with progress("rolling out the teacher", config.stage2.sequences) as report:
             teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
+    garment = jax.device_get(first.state.average["garment"])
+    begun = stage2.init(teacher, garment, config, stage2.ordinary_poses(whole.scene, reel, joints, config))
     second = fit.fit(
         stage2.make_update(teacher, config, STEPS_PER_CALL, device_mesh),
-        devices.replicate(stage2.init(teacher, jax.device_get(first.state.average["garment"]), config), device_mesh),
+        devices.replicate(begun, device_mesh),
         steps=config.stage2.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=directory / "stage2",

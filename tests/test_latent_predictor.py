@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy import small
 
-from clothjax import garment_model, latent_predictor, stage2
+from clothjax import clips, experiment, garment_model, latent_predictor, skinning, stage2
 from clothjax.config import Config, MaterialConfig
 from clothjax.stage2 import Teacher
 from clothjax.types import Material
@@ -108,6 +109,35 @@ def test_a_share_of_the_loss_is_the_vertex_error_over_the_vertices_variance(shar
     vertex = jnp.mean((pair[0] - pair[1]) ** 2) / jnp.mean((every - every.mean(0, keepdims=True)) ** 2)
     expected = (1 - share) * jnp.mean((predicted - normal[1]) ** 2) + share * vertex
     np.testing.assert_allclose(value, expected, rtol=1e-4)
+
+
+def test_motions_of_training_are_ordinary_though_the_teacher_did_not_play_them():
+    config = dataclasses.replace(small(), motions=("walk_0", "arms_0"))
+    whole = experiment.assemble(config)
+    reel, _ = experiment.training_clips(whole)
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    rows = stage2.ordinary_poses(whole.scene, reel, kept, config)
+    latents = np.random.default_rng(0).normal(size=(1, 7, 6)).astype(np.float32)
+    teacher = Teacher(latents, rows[None, :6], np.zeros((1, 3), np.float32))
+
+    def ordinary(normalizers, name):
+        poses = experiment.windows(experiment.motion(whole, name))
+        joints = skinning.shaped_joints(whole.body, jnp.zeros(10))
+
+        def one(frame):
+            inputs = latent_predictor.window_inputs(
+                clips.poses(jax.tree.map(jnp.asarray, poses), frame), joints, whole.body.parents, kept, config.fps
+            )
+            inputs = latent_predictor.normalise(normalizers.pose, inputs)
+            return latent_predictor.bounded(inputs, normalizers.pose.low, normalizers.pose.high)[1]
+
+        return np.mean(jax.vmap(one)(jnp.arange(2, 100)))
+
+    alone = stage2.init(teacher, _garment(config), config).normalizers
+    wide = stage2.init(teacher, _garment(config), config, rows).normalizers
+    for name in config.motions:
+        assert ordinary(alone, name) < 0.5 and ordinary(wide, name) == 1.0
+    assert ordinary(wide, "jump_0") < 0.5
 
 
 def test_a_code_that_the_network_does_not_hold_is_forgotten():
