@@ -247,7 +247,9 @@ class TuningConfig(Stage1Config):
 
     steps: int = 0
     pool: int = 192
-    learning_rate: float = 1e-4
+    learning_rate: float = 1.5e-4
+    clip: float = 20.0
+    """Three times an ordinary gradient: those of contact count for more, without drowning the others."""
     start_timestep: float = 0.0
     preconditioning: float = 0.5
     """Power of Phi's inverse Hessian that gradients of codes are multiplied by; 0: none. The cloth is up to 4 000 times
