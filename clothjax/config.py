@@ -253,7 +253,16 @@ class TuningConfig(Stage1Config):
     start_timestep: float = 0.0
     preconditioning: float = 0.5
     """Power of Phi's inverse Hessian that gradients of codes are multiplied by; 0: none. The cloth is up to 4 000 times
-    stiffer along some codes than along others. With 1, errors of all would count alike, which energies do not."""
+    stiffer along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which
+    energies do not."""
+    betas: float = 0.0
+    """Stage 1's are used."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        _require(self.betas == 0, "tuning is for the bodies of stage 1: set stage1.betas")
+        _require(self.blendshape_rate == 0, "tuning does not train the blend shapes: set stage1.blendshape_rate")
+        _require(self.start_timestep == 0, "Psi does not know the time step: tuning.start_timestep must be 0")
 
 
 @dataclass(frozen=True)

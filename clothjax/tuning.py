@@ -10,7 +10,7 @@ import numpy as np
 from clothjax import compact_latent, latent_predictor, stage1
 from clothjax.character import Character, Window
 from clothjax.clips import Clips
-from clothjax.config import Config
+from clothjax.config import Config, Ramp, Stage1Config
 from clothjax.latent_predictor import Normalizers
 from clothjax.losses import TimeStep
 from clothjax.rollout import Animator
@@ -20,8 +20,16 @@ from clothjax.types import Array, ClothState, Pose
 
 
 def settings(config: Config) -> Config:
-    """The configuration with that of the tuning in the place of stage 1's, for the same bodies."""
-    return dataclasses.replace(config, stage1=dataclasses.replace(config.tuning, betas=config.stage1.betas))
+    """The configuration with that of the tuning in the place of stage 1's: for its bodies, at its last loss weights."""
+    names = [field.name for field in dataclasses.fields(Stage1Config)]
+    stage = Stage1Config(**{name: getattr(config.tuning, name) for name in names} | {"betas": config.stage1.betas})
+    ramps = {field.name: getattr(config.loss, field.name) for field in dataclasses.fields(config.loss)}
+    last = {
+        name: Ramp(ramp.start if ramp.end is None else ramp.end)
+        for name, ramp in ramps.items()
+        if isinstance(ramp, Ramp)
+    }
+    return dataclasses.replace(config, stage1=stage, loss=dataclasses.replace(config.loss, **last))
 
 
 def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.TrainingState:
@@ -74,11 +82,13 @@ def psi(
                 constants,
                 config.stage2.latent_decay,
             )
-            if matrix is not None:
-                latent = precondition(matrix, latent)
-            latent = latent_predictor.denormalise(normalizers.latent, latent)
-            new = compact_latent.decode({"garment": garment}, scene, character, latent, window, config.model)
-            return new, latent, None
+            # in range as in use, where there is no gradient to lose
+            inside, _ = latent_predictor.bounded(latent, normalizers.latent.low, normalizers.latent.high)
+            latent = latent + jax.lax.stop_gradient(inside - latent)
+            shown = latent if matrix is None else precondition(matrix, latent)
+            code, shown = (latent_predictor.denormalise(normalizers.latent, z) for z in (latent, shown))
+            new = compact_latent.decode({"garment": garment}, scene, character, shown, window, config.model)
+            return new, code, None
 
         return animate
 

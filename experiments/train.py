@@ -51,7 +51,8 @@ def main(argv: list[str]) -> None:
     directory = run_directory(config, argv)
     with devices.together(directory):
         wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
-        train(config, directory, devices.choose(wanted, config.stage1.batch, config.stage2.batch))
+        batches = [config.stage1.batch, config.stage2.batch] + [config.tuning.batch] * (config.tuning.steps > 0)
+        train(config, directory, devices.choose(wanted, *batches))
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:

@@ -17,6 +17,8 @@ import yaml
 from toy import assert_same, small
 
 from clothjax import checkpoint, configuration, devices
+from clothjax.config import TuningConfig
+from experiments import train
 
 ROOT = Path(__file__).parents[1]
 
@@ -95,6 +97,7 @@ def config(tmp_path_factory):
         config,
         stage1=dataclasses.replace(config.stage1, steps=20, pool=8, batch=4, restart_probability=0.5),
         stage2=dataclasses.replace(config.stage2, steps=20, batch=4, sequences=3),
+        tuning=TuningConfig(steps=20, batch=4, pool=8),
     )
     path = tmp_path_factory.mktemp("several") / "small.yaml"
     path.write_text(yaml.safe_dump(json.loads(json.dumps(configuration.to_dict(config)))))
@@ -146,6 +149,15 @@ for one, four in zip(teachers[0], teachers[1], strict=True):
 """
 
 
+def test_a_batch_of_any_stage_that_cannot_be_divided_is_refused_before_training(config, monkeypatch, tmp_path):
+    one = jax.devices()[0]
+    monkeypatch.setattr(devices.jax, "devices", lambda: [one] * 4)
+    for stage in ("stage1", "stage2", "tuning"):
+        with pytest.raises(ValueError, match=r"cannot be divided among 4 devices: .* tuning\.batch"):
+            train.main([str(config), "--directory", str(tmp_path), "--devices", "4", f"--{stage}.batch", "6"])
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_four_devices_take_the_step_of_one(config):
     """Parameters to 1e-6 after one update; after that Adam turns rounding into whole steps. Teachers likewise."""
@@ -169,8 +181,8 @@ def pair(config, directory, *arguments):
 
 
 def trained(directory):
-    """What a training left: the parameters of Phi and of Psi."""
-    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in ("stage1", "stage2")]
+    """What a training left: the parameters of Phi, of Psi and of Psi after its tuning."""
+    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in ("stage1", "stage2", "tuning")]
 
 
 @pytest.mark.slow

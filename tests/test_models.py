@@ -1,0 +1,49 @@
+"""The garments that come with the library."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import clothjax as cj
+from clothjax import skinning, storage, topology, trained
+from clothjax.types import Motion, Pose
+
+
+def test_four_garments_come_with_the_library():
+    assert trained.shipped() == ("dress", "pants", "skirt", "tshirt")
+
+
+@pytest.mark.parametrize("name", trained.shipped())
+def test_a_shipped_garment_moves_like_cloth_on_a_body_that_walks(name):
+    folder = trained.folder(name)
+    assert (folder / trained.WEIGHTS).stat().st_size < 4e6
+    report = json.loads((folder / "report.json").read_text())
+    assert report["command"] and report["hours"] > 0 and report["evaluation"]["psi"]["finite"]
+
+    model = cj.load(name)
+    clip = storage.load_motion("walk_3")
+    clip = Motion(clip.rotations[:60], (clip.translation - clip.translation[0])[:60].astype(np.float32), clip.fps)
+    vertices, ok = cj.animate(model, clip)
+    vertices = np.asarray(vertices)
+    assert np.isfinite(vertices).all() and np.mean(ok) > 0.9
+
+    poses = [Pose(jnp.asarray(r), jnp.asarray(t)) for r, t in zip(clip.rotations, clip.translation)]
+    parents = np.array(model.parents)
+    skinned = np.stack([
+        np.asarray(skinning.apply(
+            skinning.blend(model.garment.weights, skinning.joint_transforms(p.rotations, model.joints, parents)),
+            model.garment.vertices,
+        ) + p.translation)
+        for p in poses
+    ])  # fmt: skip
+    away = np.linalg.norm(vertices - skinned, axis=-1)
+    assert 1e-3 < away.mean() < 0.1 and away.max() < 0.4  # m: it hangs, and stays on the body
+    swing = np.diff(vertices - skinned, axis=0)[10:]
+    assert np.sqrt(np.mean(swing**2)) > 2e-4  # m a frame
+
+    edges = topology.edges(np.asarray(model.garment.faces))
+    length, rest = (np.linalg.norm(x[..., edges[:, 0], :] - x[..., edges[:, 1], :], axis=-1)
+                    for x in (vertices, np.asarray(model.garment.vertices)))  # fmt: skip
+    assert np.percentile(np.abs(length / rest - 1), 95) < 0.15
