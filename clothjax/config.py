@@ -243,7 +243,8 @@ class Stage1Config:
 
 @dataclass(frozen=True)
 class TuningConfig(Stage1Config):
-    """Training of Psi on the physics after its regression: as stage 1, with Psi in the place of Phi, on its bodies."""
+    """Training of Psi on the physics after its regression: as stage 1, with Psi in the place of Phi. The bodies are
+    those of `stage1.betas`; `betas` here is not read."""
 
     steps: int = 0
     pool: int = 192
@@ -255,12 +256,9 @@ class TuningConfig(Stage1Config):
     """Power of Phi's inverse Hessian that gradients of codes are multiplied by; 0: none. The cloth is up to 4 000 times
     stiffer along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which
     energies do not."""
-    betas: float = 0.0
-    """Stage 1's are used."""
 
     def __post_init__(self):
         super().__post_init__()
-        _require(self.betas == 0, "tuning is for the bodies of stage 1: set stage1.betas")
         _require(self.blendshape_rate == 0, "tuning does not train the blend shapes: set stage1.blendshape_rate")
         _require(self.start_timestep == 0, "Psi does not know the time step: tuning.start_timestep must be 0")
 
