@@ -253,7 +253,8 @@ class TuningConfig(Stage1Config):
     """Three times an ordinary gradient: those of contact count for more, without drowning the others."""
     start_timestep: float = 0.0
     preconditioning: float = 0.5
-    """Power of Phi's inverse Hessian that gradients of codes are multiplied by; 0: none. The cloth is up to 4 000 times
+    """Power of Phi's inverse Hessian, where `model.latent_update` is `descent`, that gradients of codes are multiplied
+    by; 0: none. The cloth is up to 4 000 times
     stiffer along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which
     energies do not."""
 

@@ -15,7 +15,7 @@ SLACK = 0.02  # m/s, m or of a rotation matrix: what an input may be out of its 
 
 
 class Scale(NamedTuple):
-    """How rows [N] are made comparable, and the range they were in over the teacher's rollouts."""
+    """How rows [N] are made comparable, and the range that is ordinary for them."""
 
     mean: Array  # [N]
     deviation: Array  # [N]

@@ -69,9 +69,9 @@ def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
 
 
 def blank(model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> Teacher:
-    """A rollout of zeros: all that is needed of a teacher to read a training that is finished."""
+    """A rollout of NaN: what is needed of a teacher to read a training that is finished, and nothing to train on."""
     shapes = jax.eval_shape(make_rollout(scene, kept, config), jax.random.key(0), model, clips)
-    return jax.tree.map(lambda part: np.zeros((1, *part.shape), part.dtype), shapes)
+    return jax.tree.map(lambda part: np.full((1, *part.shape), np.nan, part.dtype), shapes)
 
 
 def teach(
@@ -117,7 +117,7 @@ def ordinary_poses(scene: Scene, clips: Clips, kept: np.ndarray, config: Config)
 
 
 def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray | None = None) -> TrainingState:
-    """The state before the first step, its normalizers measured on the teacher's rollouts.
+    """The state before the first step, its normalizers measured on the teacher's rollouts and `ordinary`.
 
     Args:
         ordinary: more inputs [n, P], as of `ordinary_poses`.

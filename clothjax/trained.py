@@ -19,6 +19,7 @@ from clothjax.latent_predictor import Normalizers, Scale
 
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG = "model.npz", "config.yaml"
+STAGES = ("stage1", "stage2", "tuning")
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 LARGE = 2000  # entries of a matrix that is worth eight bits
@@ -50,9 +51,8 @@ def phi(run: str | Path) -> tuple[Config, dict]:
         config, parts = _unpack(Path(run))
         params, statistics = parts["phi"], parts["statistics"]
     else:
-        directory = Path(run) / "stage1" / "checkpoints"
-        parts, about = checkpoint.read(directory, "average", "statistics")
-        config = configuration.from_dict(Config, about.config, str(directory))
+        parts, _ = checkpoint.read(Path(run) / "stage1" / "checkpoints", "average", "statistics")
+        config = _config(Path(run))
         params, statistics = parts["average"], parts["statistics"]
     return config, {"params": params, "statistics": {name: Statistics(**each) for name, each in statistics.items()}}
 
@@ -69,8 +69,8 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
         garment, predictor = parts["phi"]["garment"], parts["predictor"]
     else:
         directory, tuned = (Path(run) / stage / "checkpoints" for stage in ("stage2", "tuning"))
-        parts, about = checkpoint.read(directory, "average", "normalizers", "garment")
-        config = configuration.from_dict(Config, about.config, str(directory))
+        parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
+        config = _config(Path(run))
         garment, predictor = parts["garment"], parts["average"]
         if checkpoint.steps(tuned):
             predictor = checkpoint.read(tuned, "average")[0]["average"]
@@ -89,11 +89,18 @@ def pack(run: str | Path, out: str | Path) -> int:
     Raises:
         ValueError: if the run is not finished, or Psi was trained on another Phi than the run now has.
     """
-    config, model = phi(run)
     _, garment, predictor, normalizers = psi(run)
+    config, model = phi(run)
+    for stage in STAGES:
+        wanted = getattr(config, stage).steps
+        done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
+        if done != wanted:
+            raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
     decoder = checkpoint.named(model["params"]["garment"])
     if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(garment).items()):
-        raise ValueError(f"{run}: stage 1 was trained further after stage 2: train stage 2 again")
+        raise ValueError(
+            f"{run}: stage 1 was trained further after stage 2: remove its stage2/ and tuning/, and train again"
+        )
     parts = {
         "phi": model["params"],
         "statistics": {name: each._asdict() for name, each in model["statistics"].items()},
@@ -115,6 +122,12 @@ def pack(run: str | Path, out: str | Path) -> int:
     np.savez_compressed(out / WEIGHTS, **arrays)
     (out / CONFIG).write_text(yaml.safe_dump(configuration.to_dict(config), sort_keys=False))
     return (out / WEIGHTS).stat().st_size
+
+
+def _config(run: Path) -> Config:
+    """The configuration of a run's last stage: those before may have been trained with other settings of later ones."""
+    last = [run / stage / "checkpoints" for stage in STAGES if checkpoint.steps(run / stage / "checkpoints")][-1]
+    return configuration.from_dict(Config, checkpoint.latest(last).config, str(last))
 
 
 def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:

@@ -49,6 +49,7 @@ import numpy as np
 from clothjax import character as characters
 from clothjax import clips, experiment, inference, metrics, rollout, simulation, storage, trained
 from clothjax.character import Character
+from clothjax.config import EvaluationConfig
 from clothjax.experiment import Experiment
 from clothjax.types import Motion, Pose
 from experiments.session import fail_clearly, progress, setup
@@ -56,7 +57,7 @@ from experiments.train import load_phi
 
 STAGES = ("lbs", "phi", "psi")
 WEARERS_FRAMES, WEARERS_GAPS = 90, 4  # of the closed loop of each wearer, and where the solver is asked
-SETTLING = 5  # frames left out of averages over time: the start is a skinned garment
+SETTLING = 5  # frames left out of averages over time: Psi starts from a garment as skinned
 
 
 def main(argv: list[str]) -> None:
@@ -92,9 +93,8 @@ def pretrained(folders: dict[str, Path], motions: list[str] | None = None) -> di
             there = [motion for motion in wanted if storage.asset(motion).is_file()]
             print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
         reports[name] = evaluate(folder, there)
-    stages = [{**report, **report.pop("evaluation")} for report in reports.values()]
-    mean = {stage: _mean([each[stage] for each in stages]) for stage in STAGES}
-    return {"mean": mean} | dict(zip(reports, stages))
+    flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
+    return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in STAGES}} | flat
 
 
 def kept(run: Path) -> Path:
@@ -102,9 +102,13 @@ def kept(run: Path) -> Path:
     return Path("runs") / "pretrained" / run.name if trained.packed(run) else run
 
 
-def evaluate(run: Path, motions: list[str] | None = None) -> dict:
-    """All measures, under `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`."""
-    whole, phi = load_phi(run)
+def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None) -> dict:
+    """All measures, under `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`.
+
+    Args:
+        settings: default: those that the run was trained with.
+    """
+    whole, phi = load_phi(run, settings)
     kept(run).mkdir(parents=True, exist_ok=True)
     config = whole.config
     betas = experiment.betas(config)
@@ -160,6 +164,7 @@ def _motion(whole: Experiment, play, phi, psi, character: Character, betas, clip
         config,
     )
     done(2)
+    solved = solved[:frames]  # of a clip shorter than that, the solver's goes one frame further
     advance = np.asarray(poses.translation[:, 2])
     count = len(solved)
     rough = metrics.roughness(solved[SETTLING:], advance[SETTLING : count - 1])

@@ -36,8 +36,8 @@ def main(argv: list[str]) -> None:
     trained = time.monotonic() - started
 
     print("measuring against the reference solver")
-    report = evaluate(directory)
-    whole, _ = load_phi(directory)
+    report = evaluate(directory, settings=config.evaluation)
+    whole, _ = load_phi(directory, config.evaluation)
     motion = config.evaluation.motions[0]
     betas = experiment.betas(config)
 

@@ -13,6 +13,7 @@ Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere
 """
 
 import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -35,7 +36,7 @@ from clothjax import (
     trained,
     tuning,
 )
-from clothjax.config import Config
+from clothjax.config import Config, EvaluationConfig
 from experiments.session import fail_clearly, progress, setup
 
 STEPS_PER_CALL = 20
@@ -106,8 +107,11 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi"
     )
     if checkpoint.steps(directory / "stage2" / "checkpoints")[-1:] == [config.stage2.steps]:
+        # were it not readable, training would go on from the one before, and stop at the first NaN
         teacher, seconds = stage2.blank(model, whole.scene, reel, joints, config), 0.0
     else:
+        if checkpoint.steps(directory / "tuning" / "checkpoints"):
+            raise ValueError(f"{directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
         with progress("rolling out the teacher", config.stage2.sequences) as report:
             teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
     garment = jax.device_get(first.state.average["garment"])
@@ -165,10 +169,14 @@ def _spent(directory: Path, **seconds: float) -> dict[str, float]:
 DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning")
 
 
-def load_phi(directory: Path) -> tuple[experiment.Experiment, dict]:
-    """Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`."""
+def load_phi(directory: Path, evaluation: EvaluationConfig | None = None) -> tuple[experiment.Experiment, dict]:
+    """Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`.
+
+    Args:
+        evaluation: in the place of what the run was trained with.
+    """
     config, model = trained.phi(directory)
-    return experiment.assemble(config), model
+    return experiment.assemble(dataclasses.replace(config, evaluation=evaluation or config.evaluation)), model
 
 
 if __name__ == "__main__":
