@@ -3,8 +3,8 @@
     python -m experiments.gallery --pretrained skirt --out skirt.png
     python -m experiments.gallery runs/skirt --motions walk_3 dance_3 run_3 --frame 45 --out skirt.png
 
-The bodies are a thin, the mean and a heavy one, the cloth is the middling one of `experiment.wearers`. All start as
-skinned at the motion's start; what is shown is the same frame of each.
+The bodies are a thin, the mean and a heavy one, the cloth is the middling one of `experiment.wearers`. All start at
+the motion's start; what is shown is the same frame of each.
 """
 
 import argparse
@@ -14,10 +14,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from clothjax import animation, experiment, inference, simulation, trained
+from clothjax import animation, experiment, inference, rollout, simulation, trained
 from clothjax import character as characters
 from clothjax.types import Motion
-from experiments.evaluate import phi_trajectory, psi_trajectory, windows
+from experiments.evaluate import psi_trajectory, windows
 from experiments.render import body_trajectory, dressed
 from experiments.session import fail_clearly, progress, setup
 from experiments.train import load_phi
@@ -49,27 +49,29 @@ def pictures(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[
     whole, phi = load_phi(run)
     config = whole.config
     wearers = experiment.wearers(whole)
+    play = jax.jit(lambda m, c, p: rollout.play(m, whole.scene, c, p, config)[1].position)
+    at = frame - 1  # what is measured starts at a clip's second frame
     rows, columns = {"Phi": [], "Psi": [], "solver": []}, []
     with progress("simulating", len(motions) * len(BODIES)) as report:
         for motion in motions:
             clip = experiment.motion(whole, motion)
-            if len(clip.translation) < frame + 3:
-                raise ValueError(f"{motion} has {len(clip.translation)} frames; --frame {frame} needs {frame + 3}")
-            clip = Motion(clip.rotations[: frame + 3], clip.translation[: frame + 3], clip.fps)
+            if not 1 <= frame <= len(clip.translation) - 2:
+                raise ValueError(f"{motion} has frames 1 to {len(clip.translation) - 2} to show, not {frame}")
+            clip = Motion(clip.rotations[: frame + 2], clip.translation[: frame + 2], clip.fps)
             poses = windows(clip)
             for shape in BODIES:
                 betas, material = wearers[f"{shape}, {CLOTH}"]
                 character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(betas, material)
                 tracks = {
-                    "Phi": phi_trajectory(whole, phi, character, poses),
+                    "Phi": np.asarray(play(phi, character, poses)),
                     "Psi": psi_trajectory(inference.load(run, betas=betas, material=material), clip),
                     "solver": simulation.simulate(whole.scene, character, poses, config)[0],
                 }
                 body, root = body_trajectory(whole, clip, betas)
-                camera = animation.camera_for(body[frame : frame + 1])
-                floor = float((body + root[:, None])[..., 1].min() - root[frame, 1])
+                camera = animation.camera_for(body[at : at + 1])
+                floor = float((body + root[:, None])[..., 1].min() - root[at, 1])
                 for name, track in tracks.items():
-                    surfaces = dressed(whole, body[frame], track[frame])
+                    surfaces = dressed(whole, body[at], track[at])
                     rows[name].append(animation.render(surfaces, camera, SIZE, floor=floor))
                 columns.append(f"{Path(motion).stem}, {shape}")
                 report(len(columns))

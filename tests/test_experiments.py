@@ -76,9 +76,11 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys):
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
     picture = finished / "bodies.png"
-    gallery.main([str(finished), "--motions", "twist_3", "--frame", "1", "--out", str(picture)])
+    gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(picture)])
     width, height = Image.open(picture).size
     assert width > 3 * gallery.SIZE[0] and height > 3 * gallery.SIZE[1]  # three bodies; three methods
+    with pytest.raises(ValueError, match=r"twist_3 has frames 1 to \d+ to show, not 1000"):
+        gallery.main([str(finished), "--motions", "twist_3", "--frame", "1000", "--out", str(picture)])
 
 
 def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):

@@ -37,8 +37,14 @@ def toy():
         jax.random.key(0), left * channels, 0.1 * blendshapes.laplacian(whole.scene, config), config.model
     )
     predictor = latent_predictor.init(jax.random.key(1), left * channels, count, len(constants), config.stage2)
-    scales = [Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6)) for n in (left * channels, count)]
-    return whole, reel, kept, garment, predictor, Normalizers(*scales)
+    rng = np.random.default_rng(0)
+
+    def scale(size, limit):
+        rows = (0.1 * rng.normal(size=size), rng.uniform(0.5, 2.0, size), np.full(size, -limit), np.full(size, limit))
+        return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
+
+    # codes of an untrained network stay near zero: some of them are out of so narrow a range
+    return whole, reel, kept, garment, predictor, Normalizers(scale(left * channels, 0.1), scale(count, 1e6))
 
 
 def test_psi_in_training_is_psi_in_use(toy):
@@ -53,20 +59,27 @@ def test_psi_in_training_is_psi_in_use(toy):
     for t in range(3):
         state, _ = inference.step(model, state, pose[t])
     following, vertices = inference.step(model, state, pose[3])
+    at_bounds = np.isclose(np.abs(following.latent), 0.1)
+    assert at_bounds.any() and not at_bounds.all() and not following.ok
 
     character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
     animate = tuning.psi(garment, normalizers, kept)({"params": predictor}, whole.scene, character, config)
     around = motion.poses(jax.tree.map(jnp.asarray, experiment.windows(clip)), 2)
     window = characters.window(whole.scene, character, around)
-    cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), state.latent)
+    code = latent_predictor.denormalise(normalizers.latent, state.latent)
+    cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code)
     new, latent, seen = jax.jit(lambda c: animate(c, around, window, None, None))(cloth)
     assert seen is None
-    np.testing.assert_allclose(latent, following.latent, atol=1e-5)
+    np.testing.assert_allclose(latent_predictor.normalise(normalizers.latent, latent), following.latent, atol=1e-5)
     np.testing.assert_allclose(new + pose[2].translation[None], vertices, atol=2e-5)
 
 
 def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
     whole, reel, kept, garment, predictor, normalizers = toy
+    normalizers = Normalizers(*(
+        Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6))
+        for n in (len(normalizers.latent.mean), len(normalizers.pose.mean))
+    ))  # fmt: skip
     config = tuning.settings(whole.config)
     state = tuning.init(predictor, whole.scene, reel, whole.config)
     assert jax.tree.structure(state.params) == jax.tree.structure(predictor) and not state.statistics
@@ -76,6 +89,36 @@ def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
     # the same simulations once more, by the predictor that they have trained
     _, again = update(tuning.init(state.params, whole.scene, reel, whole.config))
     assert np.mean(again["loss"]) < 0.95 * np.mean(metrics["loss"])
+
+
+def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
+    whole, reel, kept, garment, predictor, normalizers = toy
+    config, betas = whole.config, jnp.linspace(-1, 1, 10)
+    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
+    poses = motion.poses(reel, 5)
+    window = characters.window(whole.scene, character, poses)
+    size = len(normalizers.latent.mean)
+    root = np.random.default_rng(0).normal(size=(size, size))
+    inverse = root @ root.T + np.eye(size)
+    last = max(name for name in predictor if name.startswith("dense"))
+    cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), jnp.zeros(size))
+
+    def found(inverse):
+        make = tuning.psi(garment, normalizers, kept, inverse, 0.5)
+
+        def energy(bias):
+            params = predictor | {last: predictor[last] | {"bias": bias}}
+            new, code, _ = make({"params": params}, whole.scene, character, config)(cloth, poses, window, None, None)
+            return jnp.sum((new - 1.0) ** 2), code
+
+        return jax.jit(jax.value_and_grad(energy, has_aux=True))(predictor[last]["bias"])
+
+    (plain, code), gradient = found(None)
+    (same, same_code), preconditioned = found(inverse)
+    assert plain == same and (code == same_code).all()
+    expected = tuning.preconditioner(inverse, normalizers, 0.5) @ gradient
+    np.testing.assert_allclose(preconditioned, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
+    assert float(jnp.abs(expected - gradient).max()) > 0.1 * float(jnp.abs(gradient).max())
 
 
 def test_preconditioned_gradients_point_to_the_minimum():
