@@ -204,3 +204,11 @@ def test_round_trip_through_json():
 )
 def test_the_vertices_that_a_stack_reaches(edges, level):
     assert config.Stack(edges, 1).lowest_level == level
+
+
+@pytest.mark.parametrize(
+    "setting, said", [({"blendshape_rate": 0.1}, "stage1.blendshape_rate"), ({"start_timestep": 0.3}, "time step")]
+)
+def test_tuning_refuses_what_it_would_ignore(setting, said):
+    with pytest.raises(ValueError, match=said):
+        config.TuningConfig(steps=10, **setting)

@@ -11,7 +11,7 @@ from toy import small
 from clothjax import blendshapes, compact_latent, experiment, garment_model, inference, latent_predictor, stage1, tuning
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax.config import TuningConfig
+from clothjax.config import Config, LossConfig, Ramp, TuningConfig
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import ClothState, Pose
 
@@ -144,3 +144,15 @@ def test_preconditioned_gradients_point_to_the_minimum():
     assert alignment(0.0) < alignment(0.5) < alignment(1.0)
     plain = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
     np.testing.assert_allclose(plain, np.eye(6), atol=1e-5)
+
+
+def test_tuning_has_the_last_loss_weights_and_the_bodies_of_stage_1():
+    config = dataclasses.replace(
+        Config(),
+        loss=LossConfig(collision=Ramp(0.05, 80.0, 0, 1000), inertia=Ramp(3.0)),
+        stage1=dataclasses.replace(Config().stage1, betas=1.25),
+        tuning=TuningConfig(steps=10, rollout=3),
+    )
+    used = tuning.settings(config)
+    assert used.loss.collision == Ramp(80.0) and used.loss.inertia == Ramp(3.0) and used.loss.scale == config.loss.scale
+    assert used.stage1.betas == 1.25 and used.stage1.rollout == 3 and used.stage1.learning_rate == 1.5e-4
