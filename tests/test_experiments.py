@@ -1,4 +1,6 @@
+import dataclasses
 import json
+import shutil
 
 import jax
 import numpy as np
@@ -106,6 +108,27 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
         (tmp_path / "toy" / "model.npz").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"model\.npz: not a whole packed model"):
             inference.load("toy")
+
+
+def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_refused(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.rmtree(run / "tuning")
+    assert trained.psi(run)[0].tuning.steps == 20  # as stage 2 was told
+    with pytest.raises(ValueError, match="tuning is at step 0 of 20"):
+        trained.pack(run, tmp_path / "packed")
+    assert not (tmp_path / "packed").exists()
+    shutil.copytree(finished / "tuning", run / "tuning")
+    shutil.rmtree(run / "stage2")
+    with pytest.raises(ValueError, match="tuning belongs to a stage 2 that is no longer there"):
+        train.train(trained.phi(run)[0], run)
+
+
+def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solvers(finished):
+    config = train.load_phi(finished)[0].config
+    settings = dataclasses.replace(config.evaluation, frames=9, betas=0.25)
+    report = evaluate.evaluate(finished, ["twist_3"], settings)
+    assert report["motions"]["twist_3"]["solver"]["frames"] == 7 and np.abs(report["betas"]).max() <= 0.25
 
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):
