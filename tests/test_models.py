@@ -35,7 +35,7 @@ def test_a_shipped_garment_moves_like_cloth_on_a_body_that_walks(name):
         np.asarray(skinning.apply(
             skinning.blend(model.garment.weights, skinning.joint_transforms(p.rotations, model.joints, parents)),
             model.garment.vertices,
-        ) + p.translation)
+        ) + p.translation[None])
         for p in poses
     ])  # fmt: skip
     away = np.linalg.norm(vertices - skinned, axis=-1)
