@@ -250,13 +250,13 @@ class TuningConfig(Stage1Config):
     pool: int = 192
     learning_rate: float = 1.5e-4
     clip: float = 20.0
-    """Three times an ordinary gradient: those of contact count for more, without drowning the others."""
+    """Three times an ordinary gradient of a skirt, whose gradients of contact then count for more without drowning the
+    others; those of a dress are larger, and nearly all of them clipped."""
     start_timestep: float = 0.0
     preconditioning: float = 0.5
     """Power of Phi's inverse Hessian, where `model.latent_update` is `descent`, that gradients of codes are multiplied
-    by; 0: none. The cloth is up to 4 000 times
-    stiffer along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which
-    energies do not."""
+    by; 0: none. The cloth is up to 4 000 times stiffer along some codes, in standard deviations, than along others.
+    With 1, errors of all would count alike, which energies do not."""
 
     def __post_init__(self):
         super().__post_init__()

@@ -27,7 +27,7 @@ def main(argv: list[str]) -> None:
     print(f"{folder}: {size / 1e6:.2f} MB of weights")
     report = pretrained({arguments.name: folder})[arguments.name]
     config, _ = trained.phi(folder)
-    seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in ("stage1", "stage2", "tuning"))
+    seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
     seconds += sum(add_seconds(arguments.run).values())
     about = {
         # the configuration is whole: it trains the same again

@@ -7,7 +7,7 @@ from experiments import quickstart
 
 @pytest.mark.slow
 def test_the_quickstart_meets_its_bars(tmp_path):
-    """A quarter of an hour on two cores; it must be quiet there, one bar is a time."""
+    """Ten minutes on two cores; it must be quiet there, one bar is a time."""
     quickstart.main(["--directory", str(tmp_path / "run")])
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     phi, psi = report["evaluation"]["phi"], report["evaluation"]["psi"]
