@@ -4,9 +4,13 @@ A network knows what it was trained on. So a frame's pose inputs, the wearer's c
 the range that they had in training, and a pose that is not finite, or no pose at all, is taken to be the last one:
 whatever comes in, the garment stays finite, and when the input is ordinary again the code forgets the rest within a
 second or two. `State.ok` tells of every frame whether nothing of this was needed.
+
+A model is one wearer's: what betas and material decide is in `Model.wearer`, all else a crowd shares.
+`clothjax.folding.specialise` makes it smaller and faster; it then runs through the same functions.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -15,39 +19,81 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import garment_model, latent_predictor, skinning, storage, trained
+from clothjax import latent_predictor, skinning, storage, trained
 from clothjax.config import Config
 from clothjax.latent_predictor import Normalizers
 from clothjax.types import Array, Body, Garment, Material, Motion, Pose
 
 FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
+HIGHEST = jax.lax.Precision.HIGHEST
+
+
+class Layer(NamedTuple):
+    """A dense layer; without a kernel, what it would make of its input comes with that."""
+
+    kernel: Array | None  # [inputs, outputs]
+    bias: Array  # [outputs]
+
+
+class Bounds(NamedTuple):
+    """The range that training has seen, and how far out of it is not worth a word."""
+
+    low: Array
+    high: Array
+    slack: Array
+
+
+class Network(NamedTuple):
+    """Psi from pose inputs [P] and the code [C] to blend shapes [K, 3 V]: what all characters share."""
+
+    pose: Array  # [P, H] kernel of the predictor's first layer
+    pose_mean: Array  # [P] of the inputs, taken from them first
+    pose_bounds: Bounds  # [P] of what is left
+    code: Layer  # [C, H] the same layer's, without the wearer's part of the bias
+    hidden: tuple[Layer, ...]  # of the predictor, the last of which gives [C]
+    code_bounds: Bounds  # [C]
+    first: Array  # [C] the code before the first frame
+    read: Layer  # [C, D] the decoder's first layer, or [C, D + K] with what it gives the weights directly
+    decoder: tuple[Layer, ...]  # its others, to [K]
+    mix: Layer | None  # [K, K'] from its weights to those of fewer shapes
+    shapes: Array  # [K, 3 V] m, or [K', 3 V], the x of all vertices first; zero where they are pinned
+    weights: Array  # [J', V] skinning weights of the joints `Model.moving`
+
+
+class Wearer(NamedTuple):
+    """What the betas and the material of one character decide."""
+
+    bias: Array  # [H] added to the predictor's first layer
+    template: Array  # [3, V] m, the shaped garment in the canonical pose
+    joints: Array  # [J, 3] m of the shaped body
+    known: Array  # bool, whether training had such
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("predictor", "garment_params", "normalizers", "garment", "joints", "constants"),
-    meta_fields=("parents", "kept", "config"),
+    data_fields=("network", "wearer", "faces"),
+    meta_fields=("names", "parents", "kept", "moving", "config"),
 )
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A garment on a character, ready to run: parameters and assets as a pytree, configuration static."""
+    """A garment on a character, ready to run: arrays as a pytree, the rest static."""
 
-    predictor: dict
-    garment_params: dict  # decoder and blend shapes
-    normalizers: Normalizers
-    garment: Garment  # its vertices are the shaped template
-    joints: Array  # [J, 3] m of the shaped body
-    constants: Array  # [C] betas and material as the predictor sees them
+    network: Network
+    wearer: Wearer  # of a crowd, with a leading axis [N]
+    faces: Array  # [F, 3] int32
+    names: tuple[str, ...]  # of the joints
     parents: tuple[int, ...]
-    kept: tuple[int, ...]
+    kept: tuple[int, ...]  # joints whose pose is an input
+    moving: tuple[int, ...]  # joints that move the garment
     config: Config
 
 
 class State(NamedTuple):
     """What the model carries from frame to frame."""
 
-    latent: Array  # [L] in standard deviations
+    latent: Array  # [C] the code, in standard deviations; of a specialised model what is made of it
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
+    positions: Array  # [2, J, 3] m of their joints, from the root's canonical place
     translation: Array  # [2, 3] m
     ok: Array  # bool, whether the last frame was within the range of training
 
@@ -64,7 +110,10 @@ def build(
     betas: Array | None = None,
     material: Material | None = None,
 ) -> Model:
-    """A model of one character; `betas` [S] default to the mean body, the material to the configured one."""
+    """A model of one character; `betas` [S] default to the mean body, the material to the configured one.
+
+    Scales and constants of the inputs are taken into the layers that read them.
+    """
     betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
     if betas.shape != (body.shapedirs.shape[-1],):
         raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
@@ -72,17 +121,65 @@ def build(
     if material is None:
         material = Material(cloth.density, cloth.mu, cloth.lam, cloth.bending)
     material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
-    return Model(
-        predictor=predictor,
-        garment_params=garment_params,
-        normalizers=normalizers,
-        garment=garment._replace(vertices=skinning.shaped_vertices(garment, betas)),
+    constants, known = latent_predictor.bounded_constants(
+        latent_predictor.constant_inputs(betas, material, cloth), config
+    )
+    latent, pose = normalizers
+    size = len(latent.mean)
+    first, *hidden = _layers(predictor)
+    of_code, of_pose, of_constants = jnp.split(first.kernel, [size, size + len(pose.mean)])
+    read, *decoder = _layers(garment_params["decoder"])
+    if config.model.decoder_skip:
+        skip = jnp.asarray(garment_params["skip"])
+        read = Layer(jnp.concatenate([read.kernel, skip], axis=1), jnp.pad(read.bias, (0, skip.shape[1])))
+    shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
+    network = Network(
+        pose=of_pose / pose.deviation[:, None],
+        pose_mean=pose.mean,
+        pose_bounds=Bounds(
+            pose.low * pose.deviation, pose.high * pose.deviation, jnp.full(len(pose.mean), latent_predictor.SLACK)
+        ),
+        code=Layer(of_code, first.bias),
+        hidden=tuple(hidden),
+        code_bounds=Bounds(latent.low, latent.high, jnp.full(size, latent_predictor.CODE_SLACK)),
+        first=-latent.mean / latent.deviation,
+        read=Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel),
+        decoder=tuple(decoder),
+        mix=None,
+        shapes=jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1),
+        weights=jnp.asarray(garment.weights).T,
+    )
+    wearer = Wearer(
+        bias=constants @ of_constants,
+        template=skinning.shaped_vertices(garment, betas).T,
         joints=skinning.shaped_joints(body, betas),
-        constants=latent_predictor.constant_inputs(betas, material, cloth),
+        known=known,
+    )
+    return Model(
+        network=network,
+        wearer=wearer,
+        faces=jnp.asarray(garment.faces),
+        names=tuple(names),
         parents=tuple(int(p) for p in body.parents),
         kept=tuple(int(k) for k in latent_predictor.kept_joints(names, config.stage2)),
+        moving=tuple(range(len(names))),
         config=config,
     )
+
+
+def _layers(mlp: dict) -> list[Layer]:
+    layers = (mlp[f"dense_{i}"] for i in range(len(mlp)))
+    return [Layer(jnp.asarray(layer["kernel"]), jnp.asarray(layer["bias"])) for layer in layers]
+
+
+def crowd(models: Sequence[Model]) -> Model:
+    """One model of many characters in the same garment, for `step_crowd`.
+
+    Args:
+        models: of different wearers, otherwise the same.
+    """
+    wearers = jax.tree.map(lambda *each: jnp.stack(each), *(model.wearer for model in models))
+    return dataclasses.replace(models[0], wearer=wearers)
 
 
 def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
@@ -117,12 +214,11 @@ def initial_state(model: Model, pose: Pose) -> State:
 
     The canonical pose takes the place of one that is not finite.
     """
-    size = model.normalizers.latent.mean.shape[0]
-    zero = latent_predictor.normalise(model.normalizers.latent, jnp.zeros(size))
     pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
     still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
     pose, ok = _sound_or(pose, still)
-    return State(zero, *(jnp.stack([x, x]) for x in pose), ok)
+    _, positions = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
+    return State(model.network.first, *(jnp.stack([x, x]) for x in (pose.rotations, positions, pose.translation)), ok)
 
 
 def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
@@ -131,39 +227,79 @@ def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
     return jax.tree.map(lambda x, y: jnp.where(sound, x, y), pose, other), sound
 
 
-@jax.jit
-def step(model: Model, state: State, pose: Pose) -> tuple[State, Array]:
+@partial(jax.jit, static_argnames="vertices")
+def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
     """The next frame: a new state, and the garment's vertices [V, 3] m in the world.
 
     Args:
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
+        vertices: False for a garment that nobody sees: then the state goes on, and there are no vertices.
     """
-    parents = np.array(model.parents)
+    network, wearer, parents = model.network, model.wearer, np.array(model.parents)
     pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
-    rotations = jnp.concatenate([pose.rotations[None], state.rotations])
-    advance = jnp.stack([pose.translation - state.translation[0], state.translation[0] - state.translation[1]])
-    inputs = latent_predictor.pose_inputs(
-        rotations, advance, model.joints, parents, np.array(model.kept), model.config.fps
+    turns, places = skinning.forward_kinematics(pose.rotations, wearer.joints, parents)
+    rotations, positions, translation = (
+        jnp.concatenate([new[None], old])
+        for new, old in zip((pose.rotations, places, pose.translation), state[1:4], strict=True)
     )
-    scales = model.normalizers
-    inputs = latent_predictor.normalise(scales.pose, inputs)
-    slack = latent_predictor.SLACK / scales.pose.deviation
-    inputs, ordinary = latent_predictor.bounded(inputs, scales.pose.low, scales.pose.high, slack)
-    constants, known = latent_predictor.bounded_constants(model.constants, model.config)
-    latent = latent_predictor.predict(
-        model.predictor, state.latent, inputs, constants, model.config.stage2.latent_decay
+    advance = translation[:2] - translation[1:]
+    inputs = latent_predictor.pose_inputs(rotations, positions, advance, np.array(model.kept), model.config.fps)
+    inputs, ordinary = latent_predictor.bounded(inputs - network.pose_mean, *network.pose_bounds)
+    latent, inside = latent_predictor.bounded(
+        predict(network, state.latent, inputs, wearer.bias, model.config), *network.code_bounds
     )
-    latent, bounded = latent_predictor.bounded(latent, scales.latent.low, scales.latent.high)
-    code = latent_predictor.denormalise(model.normalizers.latent, latent)
-    free = 1.0 - model.garment.pinned.astype(code.dtype)
-    displaced = garment_model.displacement(model.garment_params, code, free, model.config.model)
-    transforms = skinning.joint_transforms(pose.rotations, model.joints, parents)
-    vertices = garment_model.vertices(
-        displaced, model.garment.vertices, skinning.blend(model.garment.weights, transforms)
-    )
-    ok = sound & ordinary & known & bounded
-    following = State(latent, rotations[:2], jnp.stack([pose.translation, state.translation[0]]), ok)
-    return following, vertices + pose.translation[None]
+    ok = sound & ordinary & wearer.known & inside
+    following = State(latent, rotations[:2], positions[:2], translation[:2], ok)
+    if not vertices:
+        return following, None
+    displaced = jnp.matmul(blend_weights(network, latent, model.config), network.shapes, precision=HIGHEST)
+    transforms = skinning.bound_transforms(turns, places, wearer.joints)
+    garment = wearer.template + displaced.reshape(3, -1)
+    return following, _skin(garment, network.weights, transforms[np.array(model.moving)], pose.translation)
+
+
+def predict(network: Network, latent: Array, inputs: Array, bias: Array, config: Config) -> Array:
+    """The next code [C] from the current one, pose inputs [P] and the wearer's part [H] of the first layer."""
+    kernel, common = network.code
+    x = inputs @ network.pose + (latent[: len(bias)] if kernel is None else latent @ kernel) + common + bias
+    for kernel, bias in network.hidden:
+        x = jax.nn.relu(x) @ kernel + bias
+    return (1.0 - config.stage2.latent_decay) * latent + x
+
+
+def blend_weights(network: Network, latent: Array, config: Config) -> Array:
+    """Weights of `Network.shapes` of a code [C]."""
+    kernel, bias = network.read
+    read = bias + (latent[-len(bias) :] if kernel is None else latent @ kernel)
+    wide = len(network.decoder[0].kernel)
+    x, beside = read[:wide], read[wide:]
+    for kernel, bias in network.decoder:
+        x = jax.nn.relu(x) @ kernel + bias
+    weights = x + beside if config.model.decoder_skip else x
+    weights = jax.nn.relu(weights) if config.model.blendshape_relu else weights
+    return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
+
+
+def _skin(garment: Array, weights: Array, transforms: Array, translation: Array) -> Array:
+    """Vertices [V, 3] m of a garment [3, V] skinned by the transforms [J', 3, 4] of joints with weights [J', V].
+
+    Coordinate by coordinate: long rows are what a processor is fast at.
+    """
+    flat = transforms.reshape(-1, 12).T
+    rows = jnp.matmul(flat, weights, precision=HIGHEST).reshape(3, 4, -1)
+    x, y, z = (rows[:, i] * garment[None, i] for i in range(3))
+    return (x + y + z + rows[:, 3] + translation[:, None]).T
+
+
+@jax.jit
+def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
+    """`step` for every character of a `crowd`: states and poses have a leading axis [N], and so have the vertices."""
+    return jax.vmap(partial(step, vertices=True), (_axes(model), 0, 0))(model, states, poses)
+
+
+def _axes(model: Model) -> Model:
+    """What of a crowd's model has an axis for its characters."""
+    return dataclasses.replace(model, network=None, faces=None, wearer=0)
 
 
 @jax.jit

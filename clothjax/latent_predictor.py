@@ -11,7 +11,9 @@ from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.graph_network import Params, init_mlp, mlp
 from clothjax.types import Array, Material, Pose
 
-SLACK = 0.02  # m/s, m or of a rotation matrix: what an input may be out of its range without being worth a word
+# what may be out of its range without being worth a word
+SLACK = 0.02  # of an input: m/s, m or of a rotation matrix
+CODE_SLACK = 0.1  # of a code or a constant, as they are normalised
 
 
 class Scale(NamedTuple):
@@ -36,15 +38,14 @@ def kept_joints(names: tuple[str, ...], config: Stage2Config) -> np.ndarray:
     return np.array(kept, np.int32)
 
 
-def pose_inputs(
-    rotations: Array, advance: Array, joints: Array, parents: np.ndarray, kept: np.ndarray, fps: float
-) -> Array:
+def pose_inputs(rotations: Array, positions: Array, advance: Array, kept: np.ndarray, fps: float) -> Array:
     """What X_c holds of the motion, [6 + 3 * 6 * Jk + 3 * 3 * (Jk - 1)], without place or heading.
 
     Args:
         rotations: [3, J, 3, 3] local, at t + 1, t, t - 1.
+        positions: [3, J, 3] m of the joints in the same frames, from forward kinematics.
         advance: [2, 3] m, the root's steps t -> t + 1 and t - 1 -> t.
-        joints: [J, 3] m canonical; parents: [J] static; kept: joint indices, the root first.
+        kept: joint indices, the root first.
         fps: frames a second.
 
     The heading at t is removed from all three frames, so that turning is seen and facing is not.
@@ -52,17 +53,18 @@ def pose_inputs(
     root = int(kept[0])
     turn = rotation.heading(rotations[1, root]).T
     velocity = jnp.einsum("ab,nb->na", turn, advance, precision="highest") * fps
-    local = rotations.at[:, root].set(jnp.matmul(turn[None], rotations[:, root], precision="highest"))
-    codes = rotation.to_6d(local[:, kept])
-    _, positions = jax.vmap(lambda turns: skinning.forward_kinematics(turns, joints, parents))(local)
-    relative = positions[:, kept[1:]] - positions[:, None, root]
+    first = jnp.matmul(turn[None], rotations[:, root], precision="highest")
+    codes = rotation.to_6d(jnp.concatenate([first[:, None], rotations[:, kept[1:]]], axis=1))
+    relative = jnp.einsum("ab,tjb->tja", turn, positions[:, kept[1:]] - positions[:, None, root], precision="highest")
     return jnp.concatenate([velocity.reshape(-1), codes.reshape(-1), relative.reshape(-1)])
 
 
 def window_inputs(poses: Pose, joints: Array, parents: np.ndarray, kept: np.ndarray, fps: float) -> Array:
     """`pose_inputs` of a window of three poses, as `clips.poses` gives it."""
     advance = jnp.stack([poses.translation[2], -poses.translation[0]])
-    return pose_inputs(poses.rotations[::-1], advance, joints, parents, kept, fps)
+    rotations = poses.rotations[::-1]
+    _, positions = jax.vmap(lambda local: skinning.forward_kinematics(local, joints, parents))(rotations)
+    return pose_inputs(rotations, positions, advance, kept, fps)
 
 
 def constant_inputs(betas: Array, material: Material, config: MaterialConfig) -> Array:
@@ -107,7 +109,7 @@ def denormalise(scale: Scale, row: Array) -> Array:
     return row * scale.deviation + scale.mean
 
 
-def bounded(row: Array, low: Array, high: Array, slack: Array | float = 0.1) -> tuple[Array, Array]:
+def bounded(row: Array, low: Array, high: Array, slack: Array | float = CODE_SLACK) -> tuple[Array, Array]:
     """A row [N] brought into the range [low, high], NaN to its middle, and whether it was there but for `slack`."""
     inside = jnp.where(jnp.isnan(row), 0.5 * (low + high), jnp.clip(row, low, high))
     return inside, jnp.all(jnp.abs(inside - row) <= slack)

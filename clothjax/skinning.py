@@ -44,7 +44,11 @@ def forward_kinematics(rotations: Array, joints: Array, parents: np.ndarray) -> 
 
 def joint_transforms(rotations: Array, joints: Array, parents: np.ndarray) -> Array:
     """L_k of (2) as [J, 3, 4]: forward kinematics after the inverse bind matrices (translations in m)."""
-    turn, position = forward_kinematics(rotations, joints, parents)
+    return bound_transforms(*forward_kinematics(rotations, joints, parents), joints)
+
+
+def bound_transforms(turn: Array, position: Array, joints: Array) -> Array:
+    """L_k of (2) as [J, 3, 4] from global rotations [J, 3, 3] and positions [J, 3] m, and canonical joints [J, 3] m."""
     offset = position - jnp.einsum("jab,jb->ja", turn, joints, precision=HIGHEST)
     return jnp.concatenate([turn, offset[:, :, None]], axis=-1)
 

@@ -15,10 +15,8 @@ from clothjax.types import Material
 def test_smpl_gives_the_input_count_of_the_thesis():
     names = (*tuple(f"joint{i}" for i in range(20)), "LeftHand", "RightHand", "LThumb", "RThumb")
     kept = latent_predictor.kept_joints(names, Config().stage2)
-    parents = np.array([-1, *range(23)])
     rotations = jnp.broadcast_to(jnp.eye(3), (3, 24, 3, 3))
-    joints = jnp.zeros((24, 3))
-    inputs = latent_predictor.pose_inputs(rotations, jnp.zeros((2, 3)), joints, parents, kept, 30.0)
+    inputs = latent_predictor.pose_inputs(rotations, jnp.zeros((3, 24, 3)), jnp.zeros((2, 3)), kept, 30.0)
     material = Material(*(jnp.float32(x) for x in (0.2, 2e4, 4e4, 1e-5)))
     constants = latent_predictor.constant_inputs(jnp.zeros(10), material, MaterialConfig())
     assert len(kept) == 20
@@ -52,16 +50,18 @@ def test_one_material_for_all_is_no_input_and_betas_are_still_bounded():
 
 
 def test_velocity_is_in_metres_a_second_and_in_the_heading_frame():
-    parents, joints = np.array([-1, 0]), jnp.array([[0.0, 1.0, 0.0], [0.0, 1.5, 0.0]])
+    positions = jnp.array([[[0.0, 1.0, 0.0], [0.3, 1.5, 0.0]]] * 3)
     angle = np.pi / 2  # facing +X
     turn = jnp.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], jnp.float32)
     rotations = jnp.stack([jnp.stack([turn, jnp.eye(3)])] * 3)
     advance = jnp.array([[0.05, 0.0, 0.0], [0.04, 0.0, 0.0]])
-    inputs = latent_predictor.pose_inputs(rotations, advance, joints, parents, np.array([0, 1]), 30.0)
+    inputs = latent_predictor.pose_inputs(rotations, positions, advance, np.array([0, 1]), 30.0)
     # walking the way it faces is +Z in its own frame
     np.testing.assert_allclose(inputs[:6], [0, 0, 1.5, 0, 0, 1.2], atol=1e-6)
     # and facing is not seen: the root's rotation is the identity
     np.testing.assert_allclose(inputs[6:12], [1, 0, 0, 0, 1, 0], atol=1e-6)
+    # what is on its left, +X in the world turned away, is ahead
+    np.testing.assert_allclose(inputs[-3:], [0, 0.5, 0.3], atol=1e-6)
 
 
 def _rotating_teacher(sequences=24, frames=60, size=6, seed=0) -> Teacher:

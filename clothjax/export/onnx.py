@@ -1,92 +1,371 @@
-"""ONNX: one frame of a model as a graph with the state as plain tensors."""
+"""ONNX: one frame of a model as a small graph of standard operators, with the state as plain tensors.
 
-import json
+The graph is written out, not traced: a frame takes microseconds, and every operator of a runtime costs about one.
+Opset 17 and IR 8 are the newest that ONNX Runtime 1.15, still in engines, loads.
+"""
+
+import tempfile
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from clothjax import inference
-from clothjax.inference import Model, State
-from clothjax.types import Motion, Pose
+from clothjax import folding, inference
+from clothjax.export import sidecar
+from clothjax.export.sidecar import Output
+from clothjax.inference import Layer, Model
+from clothjax.types import Array, Motion, Pose
 
-OPSET, IR_VERSION = 17, 8  # the newest that ONNX Runtime 1.15, still in engines, loads
-INPUTS = ("latent", "previous_rotations", "previous_translations", "rotations", "translation")
-OUTPUTS = ("next_latent", "next_rotations", "next_translations", "ok", "vertices")
+OPSET, IR_VERSION = 17, 8
+STATE = ("latent", "previous_rotations", "previous_positions", "previous_translations")
+INPUTS = (*STATE, "rotations", "translation")
+FOLLOWING = ("next_latent", "next_rotations", "next_positions", "next_translations", "ok")
 
 
-def to_onnx(model: Model, path: str | Path, first: Pose) -> Path:
+def to_onnx(
+    model: Model,
+    path: str | Path,
+    *,
+    batch: int | None = 1,
+    int8: bool = False,
+    output: Output = "world",
+    about: dict | None = None,
+) -> Path:
     """Writes one frame of a model as ONNX, and beside it a JSON that tells an engine how to drive it.
 
-    The graph's inputs are the state (`latent` [L], `previous_rotations` [2, J, 3, 3], `previous_translations`
-    [2, 3] m) and the pose to come (`rotations` [J, 3, 3] local, `translation` [3] m); its outputs are the next state
-    in the same order, `ok` (see `inference`) and the garment's `vertices` [V, 3] m in the world.
+    Inputs, all with a leading axis [N] of characters, are the state (`latent` [C], `previous_rotations` [2, J, 3, 3],
+    `previous_positions` [2, J, 3] m, `previous_translations` [2, 3] m) and the pose to come (`rotations` [J, 3, 3]
+    local, `translation` [3] m); outputs are the next state in the same order, `ok` (see `inference`) and `vertices`.
 
     Args:
-        first: a pose; the first state in the JSON is of a character standing in it.
+        batch: N; None for one that may differ from call to call. All wear the same body and cloth.
+        int8: matrices in eight bits, quantised dynamically.
+        output: `vertices` [V, 3] m in the world, those in the canonical pose for an engine to skin, or none, for a
+            garment that nobody sees.
+        about: more entries for the JSON.
 
     Raises:
         ImportError: if the extra `export` is not installed.
     """
     try:
         import onnx
-        from jax2onnx import to_onnx as convert
     except ImportError as error:
-        raise ImportError("ONNX export needs jax2onnx and onnx: pip install clothjax[export]") from error
+        raise ImportError("ONNX export needs onnx: pip install clothjax[export]") from error
     path = Path(path)
-    state = inference.initial_state(model, first)
-    pose = Pose(state.rotations[0], state.translation[0])
-
-    def frame(latent, rotations, translations, new_rotations, new_translation):
-        following, vertices = inference.step(
-            model, State(latent, rotations, translations, True), Pose(new_rotations, new_translation)
-        )
-        return *following, vertices
-
-    shapes = [jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (*state[:-1], *pose)]
-    graph = convert(frame, shapes, opset=OPSET, input_names=list(INPUTS), output_names=list(OUTPUTS))
-    graph.ir_version = IR_VERSION
-    onnx.checker.check_model(graph)
-    onnx.save(graph, str(path))
-    config = model.config
-    about = {
-        "garment": config.garment,
-        "units": "m",
-        "up": "+Y",
-        "fps": config.fps,
-        "inputs": {name: list(shape.shape) for name, shape in zip(INPUTS, shapes)},
-        "outputs": dict(zip(OUTPUTS, [*(list(x.shape) for x in state), list(model.garment.vertices.shape)])),
-        "ok": "false where the pose, the wearer or the code was outside the range of training and was brought into it",
-        "rotations": "3 x 3 matrices, row-major, local to the parent joint; the identity is the body's canonical pose",
-        "translation": "of the root joint from its canonical place",
-        "parents": list(model.parents),
-        "state": "feed next_latent, next_rotations, next_translations back; previous_* hold the newest pose first",
-        "first_latent": np.asarray(state.latent).tolist(),
-        "first_previous": "both entries are the first pose",
-        "faces": np.asarray(model.garment.faces).tolist(),
-    }  # fmt: skip
-    path.with_suffix(".json").write_text(json.dumps(about))
+    graph = _frame(model, batch, output)
+    made = onnx.helper.make_model(
+        graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)], producer_name="clothjax", ir_version=IR_VERSION
+    )
+    onnx.checker.check_model(made, full_check=True)
+    if int8:
+        _quantise(made, path)
+    else:
+        onnx.save(made, str(path))
+    shapes = {
+        value.name: [dim.dim_param or dim.dim_value for dim in value.type.tensor_type.shape.dim]
+        for value in (*graph.input, *graph.output)
+    }
+    sidecar.write(model, path, output, {"shapes": shapes} | (about or {}))
     return path
 
 
-def check_onnx(path: str | Path, model: Model, motion: Motion) -> float:
-    """The largest vertex difference in m between ONNX Runtime and jax over a motion, each in its own closed loop.
+def first_state(model: Model, pose: Pose, batch: int = 1) -> list[np.ndarray]:
+    """The state inputs before the first frame, for `batch` characters that stand in `pose`."""
+    state = inference.initial_state(model, pose)[:-1]
+    return [np.repeat(np.asarray(x, np.float32)[None], batch, axis=0) for x in state]
+
+
+def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
+    """Vertices [T, V, 3] m of a file over a motion, in ONNX Runtime on one thread.
+
+    Args:
+        model: that was written, for the state before the first frame.
 
     Raises:
         ImportError: if onnxruntime is not installed.
     """
+    run = session(path)
+    rotations, translation = (np.asarray(x, np.float32)[:, None] for x in (motion.rotations, motion.translation))
+    batch = run.get_inputs()[0].shape[0]
+    batch = batch if isinstance(batch, int) else 1
+    state = first_state(model, Pose(rotations[0, 0], translation[0, 0]), batch)
+    vertices = []
+    for pose in zip(rotations, translation):
+        pose = [np.repeat(x, batch, axis=0) for x in pose]
+        *state, shown = run.run([*FOLLOWING[:-1], "vertices"], dict(zip(INPUTS, (*state, *pose), strict=True)))
+        vertices.append(shown[0])
+    return np.stack(vertices)
+
+
+def session(path: str | Path):
+    """An ONNX Runtime session of a file, on one thread."""
     try:
         import onnxruntime
     except ImportError as error:
-        raise ImportError("checking ONNX needs onnxruntime: pip install clothjax[export]") from error
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    rotations = np.asarray(motion.rotations, np.float32)
-    translation = np.asarray(motion.translation, np.float32)
-    reference = np.asarray(inference.animate(model, motion)[0])
-    state = [np.asarray(x) for x in inference.initial_state(model, Pose(rotations[0], translation[0]))[:-1]]
-    worst = 0.0
-    for t in range(len(rotations)):
-        *state, _, vertices = session.run(None, dict(zip(INPUTS, (*state, rotations[t], translation[t]))))
-        worst = max(worst, float(np.linalg.norm(vertices - reference[t], axis=-1).max()))
-    return worst
+        raise ImportError("running ONNX needs onnxruntime: pip install clothjax[export]") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+class Graph:
+    """Nodes and constants of a graph under construction."""
+
+    def __init__(self):
+        self.nodes, self.constants = [], []
+
+    def __call__(self, operator: str, *inputs: str | Array, name: str | None = None, **attributes) -> str:
+        """Adds a node; arrays among its inputs become constants. Returns the name of its output."""
+        import onnx
+
+        inputs = [x if isinstance(x, str) else self.constant(x) for x in inputs]
+        name = name or f"{operator.lower()}_{len(self.nodes)}"
+        self.nodes.append(onnx.helper.make_node(operator, inputs, [name], name=name, **attributes))
+        return name
+
+    def constant(self, array: Array) -> str:
+        import onnx
+
+        array = np.asarray(array)
+        if array.dtype == np.float64:
+            array = array.astype(np.float32)
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
+        return name
+
+    def reshape(self, x: str, *shape: int) -> str:
+        # zero keeps the axis of characters
+        return self("Reshape", x, np.array((0, *shape), np.int64))
+
+    def slice(self, x: str, axis: int, start: int, end: int, name: str | None = None) -> str:
+        return self("Slice", x, *(np.array([i], np.int64) for i in (start, end, axis)), name=name)
+
+    def within(self, x: str, low: Array, high: Array, name: str | None = None) -> tuple[str, str]:
+        """x brought into [low, high], and how far it was moved."""
+        inside = self("Min", self("Max", x, np.asarray(low)), np.asarray(high), name=name)
+        return inside, self("Abs", self("Sub", inside, x))
+
+    def layer(self, x: str, layer: Layer) -> str:
+        return self("Add", self("MatMul", x, np.asarray(layer.kernel), name=f"dense_{len(self.nodes)}"), layer.bias)
+
+    def even(self, x: str, limits: Array, layer: Layer) -> str:
+        """`layer` of inputs within +-`limits`, both scaled so that no input is small beside the others (Xiao et al.
+        2023): eight bits are shared by all of a row."""
+        kernel = np.asarray(layer.kernel)
+        scale = np.sqrt(np.maximum(limits, 1e-6) / np.maximum(np.abs(kernel).max(axis=1), 1e-6)).astype(np.float32)
+        return self.layer(self("Mul", x, 1.0 / scale), Layer(kernel * scale[:, None], layer.bias))
+
+
+def _frame(model: Model, batch: int | None, output: Output):
+    """The graph of one frame, operator for operator `inference.step`."""
+    import onnx
+
+    g, network, wearer = Graph(), model.network, model.wearer
+    joints, root, count = np.asarray(wearer.joints, np.float32), model.kept[0], len(model.parents)
+    sound, flat, translation = _sound(g, count)
+    local = g.reshape(flat, count, 3, 3)
+    chain = _chain(g, local, joints, np.array(model.parents))
+    places = _places(g, chain, joints)
+
+    rotations = g("Concat", g.reshape(flat, 1, count, 3, 3), "previous_rotations", axis=1)
+    positions = g("Concat", g.reshape(places, 1, count, 3), "previous_positions", axis=1)
+    translations = g("Concat", g.reshape(translation, 1, 3), "previous_translations", axis=1)
+    for name, rows in zip(FOLLOWING[1:], (rotations, positions, translations)):
+        g.slice(rows, 1, 0, 2, name)
+
+    inputs, order = _inputs(g, rotations, positions, translations, joints[root], model)
+    inputs = g("Sub", inputs, np.asarray(network.pose_mean)[order])
+    bounds = network.pose_bounds
+    inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
+    latent, strayed = _predict(g, inputs, model, order)
+    slack = np.concatenate([np.asarray(bounds.slack)[order], np.asarray(network.code_bounds.slack)])
+    fine = g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack[None])
+    fine = _all(g, fine)
+    g("And", g("And", fine, sound), np.array([[bool(wearer.known)]]), name="ok_column")
+    g("Reshape", "ok_column", np.array([-1], np.int64), name="ok")
+
+    vertices = len(wearer.template[0])
+    if output != "none":
+        template = np.asarray(wearer.template).reshape(-1)
+        garment = g.even(_weights(g, latent, model), _weight_limits(model), Layer(network.shapes, template))
+        if output == "world":
+            _skin(g, garment, chain, translation, model, vertices)
+        else:
+            g("Transpose", g.reshape(garment, 3, vertices), perm=[0, 2, 1], name="vertices")
+
+    number = "N" if batch is None else batch
+    widths = {
+        "latent": (len(network.first),),
+        "rotations": (2, count, 3, 3),
+        "positions": (2, count, 3),
+        "translations": (2, 3),
+    }
+
+    def described(name: str, *shape: int):
+        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, (number, *shape))
+
+    before = [described(name, *widths[name.removeprefix("previous_")]) for name in STATE]
+    after = [described(name, *widths[name.removeprefix("next_")]) for name in FOLLOWING[:-1]]
+    after.append(onnx.helper.make_tensor_value_info("ok", onnx.TensorProto.BOOL, (number,)))
+    pose = [described("rotations", count, 3, 3), described("translation", 3)]
+    shown = [] if output == "none" else [described("vertices", vertices, 3)]
+    return onnx.helper.make_graph(g.nodes, "clothjax", [*before, *pose], [*after, *shown], g.constants)
+
+
+def _all(g: Graph, flags: str) -> str:
+    """[N, 1] whether all of bools [N, n] hold."""
+    import onnx
+
+    least = g("ReduceMin", g("Cast", flags, to=onnx.TensorProto.FLOAT), axes=[1], keepdims=1)
+    return g("Greater", least, np.array([[0.5]], np.float32))
+
+
+def _sound(g: Graph, count: int) -> tuple[str, str, str]:
+    """Whether the pose is finite [N, 1]; and its rotations [N, 9 J] and translation [N, 3], or the last ones."""
+    flat = g.reshape("rotations", 9 * count)
+    # NaN is not less than anything
+    near = g("Mul", "translation", np.float32(2.0 / inference.FARTHEST))
+    sound = _all(g, g("Less", g("Abs", g("Concat", flat, near, axis=1)), np.float32(2.0)))
+    rows = []
+    for new, name, size in ((flat, "previous_rotations", 9 * count), ("translation", "previous_translations", 3)):
+        rows.append(g("Where", sound, new, g.slice(g.reshape(name, 2 * size), 1, 0, size)))
+    return sound, *rows
+
+
+def _chain(g: Graph, local: str, joints: Array, parents: Array) -> str:
+    """Skinning transforms (2) [N, J + 1, 4, 4] of local rotations [N, J, 3, 3], the last the identity.
+
+    Pointer jumping, as in `skinning.forward_kinematics`.
+    """
+    count = len(parents)
+    turned = g("ReduceSum", g("Mul", local, joints[None, :, None]), np.array([3], np.int64), keepdims=1)
+    moves = g("Concat", local, g("Sub", joints[None, :, :, None], turned), axis=3)
+    padded = g("Pad", moves, np.array([0, 0, 0, 0, 0, 1, 1, 0], np.int64))
+    rest = np.zeros((1, count + 1, 4, 4), np.float32)
+    rest[..., 3, 3] = 1.0
+    rest[:, count] = np.eye(4)
+    chain = g("Add", padded, rest)
+    ancestor = np.append(np.where(parents < 0, count, parents), count)
+    while (ancestor != count).any():
+        chain = g("MatMul", g("Gather", chain, ancestor.astype(np.int64), axis=1), chain)
+        ancestor = ancestor[ancestor]
+    return chain
+
+
+def _places(g: Graph, chain: str, joints: Array) -> str:
+    """Positions [N, J, 3] m of the joints."""
+    count = len(joints)
+    homogeneous = np.concatenate([joints, np.ones((count, 1))], axis=1).astype(np.float32)
+    part = g("Slice", chain, *(np.array(x, np.int64) for x in ([0, 0], [count, 3], [1, 2])))
+    return g("ReduceSum", g("Mul", part, homogeneous[None, :, None]), np.array([3], np.int64), keepdims=0)
+
+
+def _inputs(
+    g: Graph, rotations: str, positions: str, translations: str, origin: Array, model: Model
+) -> tuple[str, np.ndarray]:
+    """The inputs [N, P] of `latent_predictor.pose_inputs`, in another order, and for each its place in that."""
+    root, others = model.kept[0], np.array(model.kept[1:], np.int64)
+    seen = len(others)
+    facing = g.slice(g.reshape("previous_rotations", 18 * len(model.parents)), 1, 9 * root, 9 * root + 9)
+    # cosine and sine of the heading, times something: r00 + r22 and r02 - r20
+    pick = np.zeros((9, 2), np.float32)
+    pick[[0, 8], 0], pick[2, 1], pick[6, 1] = 1.0, 1.0, -1.0
+    direction = g("MatMul", facing, pick)
+    short = g("Less", g("ReduceSumSquare", direction, axes=[1], keepdims=1), np.float32(1e-12))
+    direction = g("Where", short, np.array([[1.0, 0.0]], np.float32), direction)
+    direction = g("Div", direction, g("ReduceL2", direction, axes=[1], keepdims=1))
+    spread = np.zeros((2, 9), np.float32)
+    spread[0, [0, 8]], spread[1, 2], spread[1, 6] = 1.0, 1.0, -1.0
+    up = np.zeros((1, 9), np.float32)
+    up[0, 4] = 1.0
+    heading = g.reshape(g("Add", g("MatMul", direction, spread), up), 3, 3)
+
+    steps = g("MatMul", np.float32(model.config.fps) * np.array([[1, -1, 0], [0, 1, -1]], np.float32), translations)
+    columns = g("Slice", g("Gather", rotations, np.int64(root), axis=2), *(np.array([x], np.int64) for x in (0, 2, 3)))
+    columns = g.reshape(g("Transpose", columns, perm=[0, 1, 3, 2]), 6, 3)
+    relative = g("Sub", g("Gather", positions, others, axis=2), origin[None, None, None])
+    vectors = g("Concat", steps, columns, g.reshape(relative, 3 * seen, 3), axis=1)
+    turned = g.reshape(g("MatMul", vectors, heading), 3 * (2 + 6 + 3 * seen))
+    codes = g("Slice", g("Gather", rotations, others, axis=2), *(np.array([x], np.int64) for x in (0, 2, 4)))
+    codes = g.reshape(codes, 18 * seen)
+
+    place = np.arange(6 + 18 * (seen + 1) + 9 * seen)
+    velocity, rows, apart = np.split(place, [6, 6 + 18 * (seen + 1)])
+    rows = rows.reshape(3, seen + 1, 2, 3)  # frames, joints, columns, rows of the rotation
+    order = [velocity, rows[:, 0].reshape(-1), apart, rows[:, 1:].transpose(0, 1, 3, 2).reshape(-1)]
+    return g("Concat", turned, codes, axis=1), np.concatenate(order)
+
+
+def _predict(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:
+    """The next code [N, C], named `next_latent`, and how far it was brought back."""
+    network = model.network
+    kernel, bias = network.code
+    first = np.asarray(network.pose)[order]
+    bias = np.asarray(bias) + np.asarray(model.wearer.bias)
+    limits = [np.maximum(-np.asarray(b.low), np.asarray(b.high)) for b in (network.pose_bounds, network.code_bounds)]
+    limits[0] = limits[0][order]
+    if kernel is None:
+        x = g("Add", g.even(inputs, limits[0], Layer(first, bias)), g.slice("latent", 1, 0, len(bias)))
+    else:
+        both = g("Concat", inputs, "latent", axis=1)
+        x = g.even(both, np.concatenate(limits), Layer(np.concatenate([first, np.asarray(kernel)]), bias))
+    for layer in network.hidden:
+        x = g.layer(g("Relu", x), layer)
+    kept = g("Mul", "latent", np.float32(1.0 - model.config.stage2.latent_decay))
+    bounds = network.code_bounds
+    return g.within(g("Add", kept, x), bounds.low, bounds.high, name="next_latent")
+
+
+def _weights(g: Graph, latent: str, model: Model) -> str:
+    """The weights [N, K] of the blend shapes."""
+    network = model.network
+    size, wide = len(network.read.bias), len(network.decoder[0].kernel)
+    if network.read.kernel is None:
+        whole = len(network.first)
+        read = g("Add", g.slice(latent, 1, whole - size, whole), network.read.bias)
+    else:
+        bounds = network.code_bounds
+        read = g.even(latent, np.maximum(-np.asarray(bounds.low), np.asarray(bounds.high)), network.read)
+    x = read if size == wide else g.slice(read, 1, 0, wide)
+    for layer in network.decoder:
+        x = g.layer(g("Relu", x), layer)
+    if size > wide:
+        x = g("Add", x, g.slice(read, 1, wide, size))
+    if model.config.model.blendshape_relu:
+        x = g("Relu", x)
+    return x if network.mix is None else g.layer(x, network.mix)
+
+
+def _weight_limits(model: Model) -> np.ndarray:
+    """[K] how large the weights become."""
+    if model.network.code.kernel is None:  # codes to try are not normalised
+        return np.ones(len(model.network.shapes))
+    return np.abs(folding.ordinary_weights(model)).max(axis=0)
+
+
+def _skin(g: Graph, garment: str, chain: str, translation: str, model: Model, vertices: int) -> None:
+    """`vertices` [N, V, 3], one coordinate after the other until the end."""
+    moving = np.array(model.moving, np.int64)
+    flat = g.slice(g.reshape(g("Gather", chain, moving, axis=1), len(moving), 16), 2, 0, 12)
+    rows = g("MatMul", g("Transpose", flat, perm=[0, 2, 1]), np.asarray(model.network.weights), name="skinning")
+    one_more = np.array([0, 0, 0, 0, 0, 0, 1, 0], np.int64)
+    homogeneous = g("Pad", g.reshape(garment, 1, 3, vertices), one_more, np.float32(1.0))
+    moved = g("Mul", g.reshape(rows, 3, 4, vertices), homogeneous)
+    placed = g("Add", g("ReduceSum", moved, np.array([2], np.int64), keepdims=0), g.reshape(translation, 3, 1))
+    g("Transpose", placed, perm=[0, 2, 1], name="vertices")
+
+
+def _quantise(made, path: Path) -> None:
+    """Saves a graph whose dense layers have matrices of eight bits, with a scale for each column."""
+    try:
+        import onnx
+        from onnxruntime.quantization import QuantType, quantize_dynamic
+    except ImportError as error:
+        raise ImportError("int8 needs onnxruntime: pip install clothjax[export]") from error
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole.onnx"
+        onnx.save(made, str(whole))
+        dense = [node.name for node in made.graph.node if node.name.startswith("dense_")]
+        quantize_dynamic(
+            whole, path, weight_type=QuantType.QInt8, per_channel=True, nodes_to_quantize=dense,
+            extra_options={"MatMulConstBOnly": True},
+        )  # fmt: skip

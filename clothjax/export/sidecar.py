@@ -1,0 +1,48 @@
+"""What an engine programmer must know to drive an exported model, as JSON beside it."""
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from clothjax.inference import Model
+
+Output = Literal["world", "canonical", "none"]
+VERTICES = {
+    "world": "in the world, m",
+    "canonical": "in the canonical pose, m: skin them with skin_weights [V, skin_joints]; joint_positions are canonical",
+    "none": "none: the state goes on unseen",
+}
+
+
+def write(model: Model, path: Path, output: Output, about: dict) -> None:
+    """Writes it beside the file `path` of a model.
+
+    Args:
+        about: more entries.
+    """
+    told = {
+        "garment": model.config.garment,
+        "units": "m",
+        "up": "+Y",
+        "fps": model.config.fps,
+        "joints": list(model.names),
+        "parents": list(model.parents),
+        "rotations": "3 x 3 matrices, row-major, local to the parent joint; the identity is the body's canonical pose",
+        "translation": "of the root joint from its canonical place, m",
+        "normalisation": "inside the model: give poses as they are",
+        "ok": "false where the pose, the wearer or the code was outside the range of training and was brought into it",
+        "vertices": VERTICES[output],
+        "state": "feed next_* back as latent and previous_*, of which entry 0 is the newest pose",
+        "first_state": "latent is first_latent. Run once with the first pose, which is also both entries of "
+        "previous_rotations and previous_translations, and previous_positions of zeros; then copy entry 0 of "
+        "next_positions to both entries of previous_positions, and set latent to first_latent again",
+        "first_latent": np.asarray(model.network.first).tolist(),
+        "faces": np.asarray(model.faces).tolist(),
+    } | about
+    if output == "canonical":
+        told["skin_joints"] = list(model.moving)
+        told["skin_weights"] = np.round(np.asarray(model.network.weights).T, 5).tolist()
+        told["joint_positions"] = np.asarray(model.wearer.joints).tolist()
+    path.with_suffix(".json").write_text(json.dumps(told))

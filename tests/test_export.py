@@ -1,0 +1,164 @@
+"""What other runtimes make of a model is what jax makes of it."""
+
+import json
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import small
+
+import clothjax as cj
+from clothjax import folding, inference, skinning, storage
+from clothjax.export import onnx, safetensors, stablehlo
+from clothjax.types import Motion, Pose
+from experiments import convert
+
+
+@pytest.fixture(scope="module")
+def model():
+    return cj.load("tshirt", betas=np.linspace(-1, 1, 10))
+
+
+@pytest.fixture(scope="module")
+def motion():
+    clip = storage.load_motion("dance_3")
+    return Motion(clip.rotations[:60], (clip.translation - clip.translation[0])[:60].astype(np.float32), clip.fps)
+
+
+def apart(found, model, motion):
+    return np.linalg.norm(found - np.asarray(inference.animate(model, motion)[0]), axis=-1)
+
+
+def test_onnx_is_the_model_in_closed_loop(model, motion, tmp_path):
+    path = onnx.to_onnx(model, tmp_path / "g.onnx")
+    assert apart(onnx.run_onnx(path, model, motion), model, motion).max() < 2e-5
+    small_model = folding.specialise(model, blendshapes=100)
+    path = onnx.to_onnx(small_model, tmp_path / "s.onnx")
+    found = onnx.run_onnx(path, small_model, motion)
+    assert apart(found, small_model, motion).max() < 2e-5 and apart(found, model, motion).max() > 1e-3
+
+
+def test_onnx_of_a_folded_code_and_of_a_relu(motion, tmp_path):
+    from test_folding import wide
+
+    model = wide.__wrapped__()
+    for name, each in (("plain", model), ("folded", folding.specialise(model)),
+                       ("fewer", folding.specialise(model, blendshapes=5))):  # fmt: skip
+        path = onnx.to_onnx(each, tmp_path / f"{name}.onnx")
+        assert apart(onnx.run_onnx(path, each, motion), each, motion).max() < 1e-5
+    assert model.config.model.blendshape_relu and small().model.decoder_skip
+
+
+def test_onnx_takes_wild_input_as_the_model_does(model, motion, tmp_path):
+    run = onnx.session(onnx.to_onnx(model, tmp_path / "g.onnx"))
+    rotations, translation = np.array(motion.rotations[:12]), np.array(motion.translation[:12])
+    rotations[4, 3, 1, 1] = np.nan
+    translation[7] = np.inf
+    rotations[9] = 0.0  # no rotation at all, but finite
+    state = inference.initial_state(model, Pose(rotations[0], translation[0]))
+    tensors = onnx.first_state(model, Pose(rotations[0], translation[0]))
+    told = []
+    for turn, place in zip(rotations, translation):
+        state, vertices = inference.step(model, state, Pose(jnp.asarray(turn), jnp.asarray(place)))
+        feed = dict(zip(onnx.INPUTS, (*tensors, turn[None], place[None])))
+        *tensors, ok, shown = run.run([*onnx.FOLLOWING, "vertices"], feed)
+        np.testing.assert_allclose(shown[0], vertices, atol=1e-4)
+        assert ok.shape == (1,) and bool(ok[0]) == bool(state.ok)
+        told.append(bool(ok[0]))
+    assert not told[4] and not told[7] and not told[9] and any(told)
+
+
+def test_int8_is_small_and_near(model, motion, tmp_path):
+    whole = onnx.to_onnx(model, tmp_path / "f.onnx")
+    eight = onnx.to_onnx(model, tmp_path / "e.onnx", int8=True)
+    assert eight.stat().st_size < 0.3 * whole.stat().st_size
+    error = apart(onnx.run_onnx(eight, model, motion), model, motion)
+    assert error.max() < 4e-3 and error.mean() < 1e-3
+    assert error.mean() > 1e-6
+
+
+@pytest.mark.parametrize("batch", [3, None])
+def test_onnx_of_many_characters(batch, model, motion, tmp_path):
+    run = onnx.session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=batch))
+    pose = Pose(np.asarray(motion.rotations[20:23], np.float32), motion.translation[20:23])
+    states = [onnx.first_state(model, Pose(pose.rotations[i], pose.translation[i])) for i in range(3)]
+    together = [np.concatenate(parts) for parts in zip(*states)]
+    *_, vertices = run.run([*onnx.FOLLOWING, "vertices"], dict(zip(onnx.INPUTS, (*together, *pose))))
+    for i in range(3):
+        alone = Pose(jnp.asarray(pose.rotations[i]), jnp.asarray(pose.translation[i]))
+        expected = inference.step(model, inference.initial_state(model, alone), alone)[1]
+        np.testing.assert_allclose(vertices[i], expected, atol=2e-5)
+
+
+def test_an_engine_can_skin_the_garment_and_need_not_see_it(model, motion, tmp_path):
+    pose = Pose(np.asarray(motion.rotations[5], np.float32), motion.translation[5])
+    feed = dict(zip(onnx.INPUTS, (*onnx.first_state(model, pose), pose.rotations[None], pose.translation[None])))
+    shown = onnx.session(onnx.to_onnx(model, tmp_path / "w.onnx")).run(None, feed)
+    canonical = onnx.to_onnx(folding.specialise(model), tmp_path / "c.onnx", output="canonical")
+    *state, vertices = onnx.session(canonical).run(None, feed)
+    told = json.loads(canonical.with_suffix(".json").read_text())
+    transforms = skinning.joint_transforms(
+        jnp.asarray(pose.rotations), jnp.asarray(told["joint_positions"]), np.array(told["parents"])
+    )
+    blended = skinning.blend(jnp.asarray(told["skin_weights"]), transforms[np.array(told["skin_joints"])])
+    placed = skinning.apply(blended, jnp.asarray(vertices[0])) + pose.translation[None]
+    np.testing.assert_allclose(placed, shown[-1][0], atol=1e-4)
+    unseen = onnx.session(onnx.to_onnx(model, tmp_path / "n.onnx", output="none")).run(None, feed)
+    assert len(unseen) == len(shown) - 1
+    for one, other, same in zip(shown, unseen, state):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+        np.testing.assert_allclose(one, same, atol=1e-5)
+
+
+def test_the_first_state_as_the_json_says(model, motion, tmp_path):
+    path = onnx.to_onnx(model, tmp_path / "g.onnx")
+    told = json.loads(path.with_suffix(".json").read_text())
+    assert told["joints"][0] and len(told["joints"]) == len(told["parents"]) and told["fps"] == 30.0
+    run = onnx.session(path)
+    turn, place = np.asarray(motion.rotations[:1], np.float32), motion.translation[:1]
+    twice = [np.repeat(x[:, None], 2, axis=1) for x in (turn, place)]
+    latent = np.asarray(told["first_latent"], np.float32)[None]
+    zeros = np.zeros((1, 2, turn.shape[1], 3), np.float32)
+    found = run.run(["next_positions"], dict(zip(onnx.INPUTS, (latent, twice[0], zeros, twice[1], turn, place))))[0]
+    state = [latent, twice[0], np.repeat(found[:, :1], 2, axis=1), twice[1]]
+    for mine, theirs in zip(state, onnx.first_state(model, Pose(turn[0], place[0]))):
+        np.testing.assert_allclose(mine, theirs, atol=1e-6)
+
+
+def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
+    path = stablehlo.to_stablehlo(model, tmp_path / "g.stablehlo")
+    assert apart(stablehlo.run_stablehlo(path, model, motion), model, motion).max() < 2e-5
+
+
+def test_safetensors_hold_the_whole_model(model, motion, tmp_path):
+    for each in (model, folding.specialise(model, blendshapes=50)):
+        path = safetensors.to_safetensors(each, tmp_path / "g.safetensors")
+        again = safetensors.from_safetensors(path)
+        np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(each, motion)[0])
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"g\.safetensors: not a whole model in safetensors .*convert it again"):
+        safetensors.from_safetensors(path)
+
+
+def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(convert, "FRAMES", 40)
+    out = tmp_path / "s.onnx"
+    convert.main(["--pretrained", "skirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
+    told = json.loads(out.with_suffix(".json").read_text())
+    assert told["betas"] == [1.0] and 0 < told["distance_to_jax"]["mean_mm"] < 1
+    assert "over 40 frames of closed loop" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="are of ONNX, not of stablehlo"):
+        convert.main(["--pretrained", "skirt", "--to", "stablehlo", "--int8"])
+    with pytest.raises(ValueError, match="give the folder of a run, or --pretrained"):
+        convert.main([])
+
+
+def test_what_is_not_installed_is_said(model, monkeypatch, tmp_path):
+    for package, write, ending in (
+        ("onnx", onnx.to_onnx, "onnx"),
+        ("safetensors", safetensors.to_safetensors, "safetensors"),
+    ):
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(ImportError, match=r"pip install clothjax\[export\]"):
+            write(model, tmp_path / f"g.{ending}")
