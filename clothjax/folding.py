@@ -20,7 +20,7 @@ SAMPLES = 2048  # codes that tell which displacements occur
 def specialise(model: Model, *, blendshapes: int | None = None, max_influences: int | None = None) -> Model:
     """The model with nothing in it that its use does not need.
 
-    Exact are: the code is carried as what the two layers that read it make of it, where that takes much fewer weights, and
+    Exact are: the code is carried as what the two layers that read it make of it, where that takes much fewer weights;
     joints that move no vertex are not asked. (A code outside the range of training is then held only to what that
     range becomes, and `State.ok` may not tell it.) The arguments are lossy.
 

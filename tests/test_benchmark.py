@@ -12,7 +12,7 @@ from toy import small
 from clothjax import configuration
 from clothjax.config import Config
 from experiments import benchmark
-from experiments.benchmarks import scaling, scenes, stage1, timing
+from experiments.benchmarks import inference, ncs, scaling, scenes, stage1, timing
 
 
 @pytest.mark.slow
@@ -47,6 +47,54 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     assert figures["compile_seconds_cached"] < figures["compile_seconds_cold"]
     assert figures["scenes"]["no_bending"]["flops_ratio"] < figures["scenes"]["full"]["flops_ratio"] == 1
     assert (tmp_path / "b.png").exists()
+
+
+@pytest.mark.slow
+def test_the_parts_of_inference(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark.inference, "one_thread", lambda: None)  # this process has other tests to run
+    benchmark.main(["--part", "inference", "--quick", "--json", str(tmp_path / "b.json")])
+    figures = json.loads((tmp_path / "b.json").read_text())["inference"]
+    assert (tmp_path / "b.png").exists()
+    variants = {each["name"]: each for each in figures["variants"]}
+    assert len(variants) >= 12 and all(each["us"] > 0 for each in variants.values())
+    assert variants["folded"]["error_mm"] < 1e-3 < variants["folded, int8"]["error_mm"] < 1.0
+    assert variants["192 shapes"]["error_mm"] < variants["64 shapes"]["error_mm"]
+    assert variants["folded, int8"]["bytes"] < 0.3 * variants["folded"]["bytes"]
+    assert figures["shipped_us"] == variants[figures["shipped_form"]]["us"]
+    us = figures["paper_us"]
+    assert figures["full_over_ncs_fp32"] == pytest.approx(us[f"psi: {figures['paper_form']}"] / us["ncs"])
+    assert figures["jax_fold_ratio"] == pytest.approx(us["jax: folded"] / us["jax: plain"])
+    assert all(figures[name] > 0 for name in ("network_over_ncs_int8", "offscreen_ratio", "crowd_ratio"))
+    assert figures["export_error_mm"]["onnx"] < 0.1 and figures["export_error_mm"]["stablehlo"] < 0.1
+
+
+def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):
+    import onnx
+
+    path = ncs.write(tmp_path / "ncs.onnx", 4424)
+    weights = [x for x in onnx.load(path).graph.initializer if x.data_type == onnx.TensorProto.FLOAT]
+    counted = sum(int(np.prod(x.dims)) for x in weights if len(x.dims) in (1, 2))
+    # its network, blend shapes with the garment at rest, skinning weights of 15 joints; and a 1
+    assert counted - 3_051_776 - 3 * 4424 * 513 - 15 * 4424 <= 1
+    given = ncs.feed(path)
+    run = ncs.session(path)
+    still = {name: 0 * x if name in ("dynamic", "hidden") else x for name, x in given.items()}
+    hidden, vertices = run.run(["next_hidden", "vertices"], still)
+    assert (hidden == 0).all() and vertices.shape == (4424, 3) and np.isfinite(vertices).all()
+    moved, others = run.run(["next_hidden", "vertices"], given)
+    assert 0 < np.abs(moved).max() and np.abs(others - vertices).max() > 1e-3
+    small = ncs.write(tmp_path / "network.onnx", 4424, int8=True, whole=False)
+    assert small.stat().st_size < 3.3e6
+
+
+def test_calls_take_turns():
+    made = []
+    calls = {name: (lambda name=name: made.append(name)) for name in "ab"}
+    seconds = inference.interleaved(calls, 4)
+    assert len(made) == 2 + 4 * 2 * inference.WARM and set(seconds) == {"a", "b"}
+    turns = made[2:][:: inference.WARM]
+    assert all(set(turns[i : i + 2]) == {"a", "b"} for i in range(0, 8, 2))
+    assert inference.floor_us(64 * 2**20, 3) > inference.floor_us(2**20, 3)
 
 
 def test_the_configurations_measured_are_valid():

@@ -11,7 +11,7 @@ from toy import small
 from clothjax import blendshapes, clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
 from clothjax import character as characters
 from clothjax.export.onnx import run_onnx, to_onnx
-from clothjax.types import Garment, Motion, Pose
+from clothjax.types import Garment, Motion
 from data_prep import garment as garments
 from experiments import evaluate, render, train
 from experiments.benchmarks import scenes

@@ -57,7 +57,7 @@ def to_onnx(
     )
     onnx.checker.check_model(made, full_check=True)
     if int8:
-        _quantise(made, path)
+        quantise(made, path)
     else:
         onnx.save(made, str(path))
     shapes = {
@@ -176,7 +176,7 @@ def _frame(model: Model, batch: int | None, output: Output):
     inputs = g("Sub", inputs, np.asarray(network.pose_mean)[order])
     bounds = network.pose_bounds
     inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
-    latent, strayed = _predict(g, inputs, model, order)
+    latent, strayed = predicted(g, inputs, model, order)
     slack = np.concatenate([np.asarray(bounds.slack)[order], np.asarray(network.code_bounds.slack)])
     fine = g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack[None])
     fine = _all(g, fine)
@@ -186,7 +186,7 @@ def _frame(model: Model, batch: int | None, output: Output):
     vertices = len(wearer.template[0])
     if output != "none":
         template = np.asarray(wearer.template).reshape(-1)
-        garment = g.even(_weights(g, latent, model), _weight_limits(model), Layer(network.shapes, template))
+        garment = g.even(shape_weights(g, latent, model), _weight_limits(model), Layer(network.shapes, template))
         if output == "world":
             _skin(g, garment, chain, translation, model, vertices)
         else:
@@ -295,7 +295,7 @@ def _inputs(
     return g("Concat", turned, codes, axis=1), np.concatenate(order)
 
 
-def _predict(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:
+def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:
     """The next code [N, C], named `next_latent`, and how far it was brought back."""
     network = model.network
     kernel, bias = network.code
@@ -315,7 +315,7 @@ def _predict(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[st
     return g.within(g("Add", kept, x), bounds.low, bounds.high, name="next_latent")
 
 
-def _weights(g: Graph, latent: str, model: Model) -> str:
+def shape_weights(g: Graph, latent: str, model: Model) -> str:
     """The weights [N, K] of the blend shapes."""
     network = model.network
     size, wide = len(network.read.bias), len(network.decoder[0].kernel)
@@ -354,7 +354,7 @@ def _skin(g: Graph, garment: str, chain: str, translation: str, model: Model, ve
     g("Transpose", placed, perm=[0, 2, 1], name="vertices")
 
 
-def _quantise(made, path: Path) -> None:
+def quantise(made, path: Path) -> None:
     """Saves a graph whose dense layers have matrices of eight bits, with a scale for each column."""
     try:
         import onnx

@@ -1,4 +1,4 @@
-"""safetensors: the arrays of a model under their names, with all else it is in the header, for whoever builds a runtime."""
+"""safetensors: the arrays of a model under their names, all else it is in the header, for whoever builds a runtime."""
 
 import json
 from pathlib import Path

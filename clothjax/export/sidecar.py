@@ -11,7 +11,7 @@ from clothjax.inference import Model
 Output = Literal["world", "canonical", "none"]
 VERTICES = {
     "world": "in the world, m",
-    "canonical": "in the canonical pose, m: skin them with skin_weights [V, skin_joints]; joint_positions are canonical",
+    "canonical": "in the canonical pose, m, as are joint_positions: skin them with skin_weights [V, skin_joints]",
     "none": "none: the state goes on unseen",
 }
 

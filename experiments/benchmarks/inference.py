@@ -1,0 +1,279 @@
+"""Psi at inference: microseconds a frame against error, beside NCS, on one thread."""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+from clothjax import configuration, experiment, folding, garment_model, inference, latent_predictor, storage
+from clothjax.config import Config
+from clothjax.export import onnx, stablehlo
+from clothjax.inference import Model
+from clothjax.latent_predictor import Normalizers, Scale
+from clothjax.types import Motion, Pose
+from experiments.benchmarks import ncs
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+PAPER = ["configs/paper_tshirt.yaml"]
+SHIPPED, FINE = "tshirt", "tshirt_4000"
+FRAMES = 300
+WARM = 3  # calls in a row of which the last is timed: what a game that draws nothing else would see
+CROWDS = (1, 4, 16, 64, 256, 1024)
+NEAR = 1.0  # mm, the error that is put up with
+
+Call = Callable[[], object]
+
+
+def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS) -> dict:
+    """All figures: those against NCS at the paper's size, those of a garment of the library, floors and variants."""
+    with tempfile.TemporaryDirectory() as folder:
+        shipped = _shipped(Path(folder), rounds, frames)
+        errors = {variant["name"]: variant["error_mm"] for variant in shipped["variants"]}
+        paper = paper_size(Path(folder), rounds, errors)
+    report = paper | shipped | _crowd(rounds, crowds)
+    best = min((v for v in report["variants"] if v["onnx"] and v["error_mm"] <= NEAR), key=lambda v: v["us"])
+    return report | {"shipped_us": best["us"], "shipped_form": best["name"], "shipped_floor_us": best["floor_us"]}
+
+
+def paper_model() -> Model:
+    """Psi at the size of the thesis on the 4 000-vertex t-shirt, with random weights."""
+    config = configuration.cli(Config, PAPER)
+    whole = experiment.assemble(config)
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    size, count = config.model.latent, 6 + 18 * len(kept) + 9 * (len(kept) - 1)
+    random = np.random.default_rng(0)
+    basis = 1e-3 * random.standard_normal((config.model.blendshapes, len(whole.garment.vertices), 3)).astype(np.float32)
+    garment = garment_model.init(jax.random.key(0), size, jnp.asarray(basis), config.model)
+    last = garment["decoder"][f"dense_{len(config.model.decoder)}"]
+    last["kernel"] = 50.0 * last["kernel"]
+    constants = latent_predictor.constant_inputs(jnp.zeros(10), experiment.material(config), config.material)
+    predictor = latent_predictor.init(jax.random.key(1), size, count, len(constants), config.stage2)
+
+    def scale(size: int) -> Scale:
+        return Scale(jnp.zeros(size), jnp.ones(size), jnp.full(size, -8.0), jnp.full(size, 8.0))
+
+    normalizers = Normalizers(scale(size), scale(count))
+    return inference.build(config, whole.garment, whole.body, whole.names, garment, predictor, normalizers)
+
+
+def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
+    """The paper's Psi and NCS, both for as many vertices, as a whole and their networks alone.
+
+    Args:
+        errors: of the same forms on a trained garment, mm; the best form is the fastest that errs little enough.
+    """
+    plain = paper_model()
+    folded = folding.specialise(plain)
+    vertices = plain.wearer.template.shape[1]
+    forms = {
+        "plain": plain,
+        "folded": folded,
+        "two thirds of the shapes": folding.specialise(plain, blendshapes=2 * len(plain.network.shapes) // 3),
+    }
+    calls, size, kinds = {}, {}, {}
+    for name, model in forms.items():
+        for int8 in (False, True):
+            kind = f"{name}, int8" if int8 else name
+            path = onnx.to_onnx(model, folder / "psi.onnx", int8=int8)
+            kinds[kind] = errors[kind]
+            calls[f"psi: {kind}"], size[f"psi: {kind}"] = onnx_call(path, model), path.stat().st_size
+            path = _network(model, folder / "network.onnx", int8)
+            calls[f"psi network: {kind}"], size[f"psi network: {kind}"] = session_call(path), path.stat().st_size
+    for int8 in (False, True):
+        for whole in (True, False):
+            name = f"ncs{'' if whole else ' network'}{': int8' if int8 else ''}"
+            path = ncs.write(folder / "ncs.onnx", vertices, int8=int8, whole=whole)
+            calls[name], size[name] = session_call(path), path.stat().st_size
+    calls |= {f"jax: {name}": jax_call(forms[name]) for name in ("plain", "folded")}
+    us = interleaved(calls, rounds)
+    best = min((name for name in kinds if kinds[name] <= NEAR), key=lambda name: us[f"psi: {name}"])
+    return {
+        "full_over_ncs_fp32": us[f"psi: {best}"] / us["ncs"],
+        "full_over_ncs_int8": us[f"psi: {best}"] / us["ncs: int8"],
+        "network_over_ncs_int8": us["psi network: folded, int8"] / us["ncs network: int8"],
+        "jax_fold_ratio": us["jax: folded"] / us["jax: plain"],
+        "paper_form": best,
+        "paper_us": us,
+        "paper_bytes": size,
+        "paper_floor_us": {name: floor_us(size[name]) for name in (f"psi: {best}", "ncs", "ncs: int8")},
+    }
+
+
+def _shipped(folder: Path, rounds: int, frames: int) -> dict:
+    """Variants of a garment of the library: time, bytes, and distance to jax's unspecialised model in closed loop."""
+    config = inference.load(SHIPPED).config
+    betas = experiment.betas(config)
+    model = inference.load(SHIPPED, betas=betas)
+    clip = experiment.there_and_back(storage.load_motion("walk_3", model.names), frames)
+    motion = Motion(clip.rotations, (clip.translation - clip.translation[:1]).astype(np.float32), clip.fps)
+    reference = np.asarray(inference.animate(model, motion)[0])
+    forms = {"plain": model, "folded": folding.specialise(model)}
+    forms["two thirds of the shapes"] = folding.specialise(model, blendshapes=2 * len(model.network.shapes) // 3)
+    forms |= {f"{count} shapes": folding.specialise(model, blendshapes=count) for count in (192, 128, 64)}
+    forms["4 influences"] = folding.specialise(model, max_influences=4)
+    calls, found = {}, {}
+    for name, form in forms.items():
+        for int8 in (False, True):
+            path = onnx.to_onnx(form, folder / "form.onnx", int8=int8)
+            error = np.linalg.norm(onnx.run_onnx(path, form, motion) - reference, axis=-1)
+            kind = f"{name}, int8" if int8 else name
+            calls[kind] = onnx_call(path, form)
+            found[kind] = (error, path.stat().st_size, True)
+        if name in ("plain", "folded", "128 shapes"):
+            error = np.linalg.norm(np.asarray(inference.animate(form, motion)[0]) - reference, axis=-1)
+            calls[f"jax: {name}"] = jax_call(form)
+            found[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), False)
+    folded = forms["folded"]
+    fine = folding.on_mesh(folded, storage.load_garment(FINE, storage.load_body(config.body)), betas)
+    for int8 in (False, True):
+        kind = ", int8" if int8 else ""
+        for output in ("canonical", "none"):
+            path = onnx.to_onnx(folded, folder / "form.onnx", int8=int8, output=output)
+            calls[f"{output}{kind}"] = onnx_call(path, folded)
+        calls[f"on 4 000 vertices{kind}"] = onnx_call(onnx.to_onnx(fine, folder / "fine.onnx", int8=int8), fine)
+    calls["jax: off screen"] = jax_call(folded, vertices=False)
+    calls["jax: on 4 000 vertices"] = jax_call(fine)
+    us = interleaved(calls, rounds)
+    variants = [
+        {"name": name, "us": us[name], "error_mm": 1e3 * float(error.mean()), "error_mm_max": 1e3 * float(error.max()),
+         "bytes": size, "floor_us": floor_us(size), "onnx": exported}
+        for name, (error, size, exported) in found.items()
+    ]  # fmt: skip
+    exact = stablehlo.run_stablehlo(stablehlo.to_stablehlo(folded, folder / "form.stablehlo"), folded, motion)
+    worst = {v["name"]: v["error_mm_max"] for v in variants}
+    return {
+        "variants": variants,
+        "export_error_mm": {
+            "onnx": worst["folded"],
+            "onnx_int8": worst["folded, int8"],
+            "stablehlo": 1e3 * float(np.linalg.norm(exact - reference, axis=-1).max()),
+        },
+        "offscreen_ratio": us["jax: off screen"] / us["jax: folded"],
+        "level_of_detail_ratio": us["jax: folded"] / us["jax: on 4 000 vertices"],
+        "shipped_us_all": us,
+    }
+
+
+def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
+    """Microseconds a character of crowds in jax, every one of its own body."""
+    models = [folding.specialise(inference.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
+    calls = {}
+    for count in crowds:
+        crowd = inference.crowd([models[i % len(models)] for i in range(count)])
+        pose = _pose(models[0])
+        states = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), inference.initial_state(models[0], pose))
+        poses = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), pose)
+        step = jax.jit(inference.step_crowd).lower(crowd, states, poses).compile()
+        calls[str(count)] = lambda step=step, a=(crowd, states, poses): jax.block_until_ready(step(*a))
+    us = {name: each / int(name) for name, each in interleaved(calls, max(3, rounds // 10)).items()}
+    last = "256" if "256" in us else str(crowds[-1])
+    return {"crowd_us": us, "crowd_ratio": us[last] / us["1"]}
+
+
+def interleaved(calls: dict[str, Call], rounds: int) -> dict[str, float]:
+    """Median microseconds of each call over rounds in which all take turns, in an order that changes."""
+    taken, order = {name: [] for name in calls}, np.random.default_rng(0)
+    for call in calls.values():
+        call()
+    for _ in range(rounds):
+        for name in order.permutation(list(calls)):
+            for _ in range(WARM):
+                began = time.perf_counter()
+                calls[name]()
+                seconds = time.perf_counter() - began
+            taken[name].append(seconds)
+    return {name: 1e6 * float(np.median(seconds)) for name, seconds in taken.items()}
+
+
+def onnx_call(path: Path, model: Model) -> Call:
+    """One frame of an exported model."""
+    pose = _pose(model)
+    tensors = (*onnx.first_state(model, pose), np.asarray(pose.rotations)[None], np.asarray(pose.translation)[None])
+    run, feed = onnx.session(path), dict(zip(onnx.INPUTS, tensors, strict=True))
+    return lambda: run.run(None, feed)
+
+
+def session_call(path: Path) -> Call:
+    """One call of a graph on random inputs."""
+    run, feed = onnx.session(path), ncs.feed(path)
+    return lambda: run.run(None, feed)
+
+
+def jax_call(model: Model, vertices: bool = True) -> Call:
+    """One frame in jax, compiled."""
+    pose = _pose(model)
+    state = inference.initial_state(model, pose)
+    compiled = inference.step.lower(model, state, pose, vertices).compile()
+    return lambda: jax.block_until_ready(compiled(model, state, pose))
+
+
+def _pose(model: Model) -> Pose:
+    clip = storage.load_motion("walk_3", model.names)
+    return Pose(jnp.asarray(clip.rotations[0]), jnp.asarray(clip.translation[0], jnp.float32))
+
+
+def _network(model: Model, path: Path, int8: bool) -> Path:
+    """The predictor and the decoder alone: from pose inputs and code to the next code and the blend-shape weights."""
+    import onnx as library
+
+    g, kind = onnx.Graph(), library.TensorProto.FLOAT
+    count, size = len(model.network.pose_mean), len(model.network.first)
+    latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
+    g("Identity", onnx.shape_weights(g, latent, model), name="weights")
+    described = [
+        [library.helper.make_tensor_value_info(name, kind, (1, width)) for name, width in values.items()]
+        for values in (
+            {"inputs": count, "latent": size},
+            {"next_latent": size, "weights": len(model.network.shapes)},
+        )
+    ]
+    graph = library.helper.make_graph(g.nodes, "network", *described, g.constants)
+    opset = [library.helper.make_opsetid("", onnx.OPSET)]
+    made = library.helper.make_model(graph, opset_imports=opset, ir_version=onnx.IR_VERSION)
+    if int8:
+        onnx.quantise(made, path)
+    else:
+        library.save(made, str(path))
+    return path
+
+
+def floor_us(size: int, rounds: int = 50) -> float:
+    """Microseconds in which this machine's one thread reads so many bytes, again and again."""
+    row = np.ones(max(size // 4, 1), np.float32)
+    seconds = []
+    for _ in range(rounds):
+        began = time.perf_counter()
+        row @ row
+        seconds.append(time.perf_counter() - began)
+    return 1e6 * float(np.median(seconds))
+
+
+def one_thread() -> None:
+    """This process on one core from now on; before jax has started."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def plot(report: dict, path: Path) -> None:
+    """Error against time of the variants, with the front of those that none is better than in both."""
+    points = [(v["us"], max(v["error_mm"], 1e-4), v["name"]) for v in report["variants"]]
+    front = sorted(p for p in points if not any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in points))
+    figure, axis = plt.subplots(figsize=(8, 5), constrained_layout=True)
+    for in_jax, label in ((False, "ONNX Runtime"), (True, "jax")):
+        chosen = [p for p in points if p[2].startswith("jax") == in_jax]
+        axis.loglog([p[0] for p in chosen], [p[1] for p in chosen], "o", label=label)
+    axis.loglog([p[0] for p in front], [p[1] for p in front], "-", color="black", lw=0.8, label="Pareto front")
+    for us, error, name in points:
+        axis.annotate(name, (us, error), fontsize=7, xytext=(3, 3), textcoords="offset points")
+    axis.set(xlabel="us a frame, one thread", ylabel="mm, mean distance to the model as trained (1e-4 and less: below)")
+    axis.legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
