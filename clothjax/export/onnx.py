@@ -16,9 +16,8 @@ from clothjax.inference import Layer, Model
 from clothjax.types import Array, Motion, Pose
 
 OPSET, IR_VERSION = 17, 8
-STATE = ("latent", "previous_rotations", "previous_positions", "previous_translations")
-INPUTS = (*STATE, "rotations", "translation")
-FOLLOWING = ("next_latent", "next_rotations", "next_positions", "next_translations", "ok")
+INPUTS = ("latent", "history", "rotations", "translation")
+FOLLOWING = ("next_latent", "next_history", "ok")
 
 
 def to_onnx(
@@ -32,9 +31,9 @@ def to_onnx(
 ) -> Path:
     """Writes one frame of a model as ONNX, and beside it a JSON that tells an engine how to drive it.
 
-    Inputs, all with a leading axis [N] of characters, are the state (`latent` [C], `previous_rotations` [2, J, 3, 3],
-    `previous_positions` [2, J, 3] m, `previous_translations` [2, 3] m) and the pose to come (`rotations` [J, 3, 3]
-    local, `translation` [3] m); outputs are the next state in the same order, `ok` (see `inference`) and `vertices`.
+    Inputs, all with a leading axis [N] of characters, are the state (`latent` [C] and `history` [2, 12 J + 3], of the
+    last two frames) and the pose to come (`rotations` [J, 3, 3] local, `translation` [3] m); outputs are the next
+    state (`next_latent`, `next_history`), `ok` (see `inference`) and `vertices`.
 
     Args:
         batch: N; None for one that may differ from call to call. All wear the same body and cloth.
@@ -51,7 +50,7 @@ def to_onnx(
     except ImportError as error:
         raise ImportError("ONNX export needs onnx: pip install clothjax[export]") from error
     path = Path(path)
-    graph = _frame(model, batch, output)
+    graph = _frame(model, batch, int8, output)
     made = onnx.helper.make_model(
         graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)], producer_name="clothjax", ir_version=IR_VERSION
     )
@@ -64,14 +63,16 @@ def to_onnx(
         value.name: [dim.dim_param or dim.dim_value for dim in value.type.tensor_type.shape.dim]
         for value in (*graph.input, *graph.output)
     }
-    sidecar.write(model, path, output, {"shapes": shapes} | (about or {}))
+    sidecar.write(model, path, output, sidecar.STATE | {"shapes": shapes} | (about or {}))
     return path
 
 
 def first_state(model: Model, pose: Pose, batch: int = 1) -> list[np.ndarray]:
-    """The state inputs before the first frame, for `batch` characters that stand in `pose`."""
-    state = inference.initial_state(model, pose)[:-1]
-    return [np.repeat(np.asarray(x, np.float32)[None], batch, axis=0) for x in state]
+    """`latent` and `history` before the first frame, for `batch` characters that stand in `pose`."""
+    state = inference.initial_state(model, pose)
+    rows = (state.rotations, state.translation, state.positions)
+    history = np.concatenate([np.asarray(x).reshape(2, -1) for x in rows], axis=1)
+    return [np.repeat(np.asarray(x)[None], batch, axis=0) for x in (state.latent, history)]
 
 
 def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
@@ -110,8 +111,8 @@ def session(path: str | Path):
 class Graph:
     """Nodes and constants of a graph under construction."""
 
-    def __init__(self):
-        self.nodes, self.constants = [], []
+    def __init__(self, int8: bool = False):
+        self.nodes, self.constants, self.int8 = [], [], int8
 
     def __call__(self, operator: str, *inputs: str | Array, name: str | None = None, **attributes) -> str:
         """Adds a node; arrays among its inputs become constants. Returns the name of its output."""
@@ -149,86 +150,71 @@ class Graph:
 
     def even(self, x: str, limits: Array, layer: Layer) -> str:
         """`layer` of inputs within +-`limits`, both scaled so that no input is small beside the others (Xiao et al.
-        2023): eight bits are shared by all of a row."""
+        2023): eight bits, where they are used, are shared by all of a row."""
         kernel = np.asarray(layer.kernel)
+        if not self.int8:
+            return self.layer(x, layer)
         scale = np.sqrt(np.maximum(limits, 1e-6) / np.maximum(np.abs(kernel).max(axis=1), 1e-6)).astype(np.float32)
         return self.layer(self("Mul", x, 1.0 / scale), Layer(kernel * scale[:, None], layer.bias))
 
 
-def _frame(model: Model, batch: int | None, output: Output):
+def _frame(model: Model, batch: int | None, int8: bool, output: Output):
     """The graph of one frame, operator for operator `inference.step`."""
     import onnx
 
-    g, network, wearer = Graph(), model.network, model.wearer
-    joints, root, count = np.asarray(wearer.joints, np.float32), model.kept[0], len(model.parents)
-    sound, flat, translation = _sound(g, count)
-    local = g.reshape(flat, count, 3, 3)
-    chain = _chain(g, local, joints, np.array(model.parents))
-    places = _places(g, chain, joints)
-
-    rotations = g("Concat", g.reshape(flat, 1, count, 3, 3), "previous_rotations", axis=1)
-    positions = g("Concat", g.reshape(places, 1, count, 3), "previous_positions", axis=1)
-    translations = g("Concat", g.reshape(translation, 1, 3), "previous_translations", axis=1)
-    for name, rows in zip(FOLLOWING[1:], (rotations, positions, translations)):
-        g.slice(rows, 1, 0, 2, name)
-
-    inputs, order = _inputs(g, rotations, positions, translations, joints[root], model)
+    g, network, wearer = Graph(int8), model.network, model.wearer
+    joints, count = np.asarray(wearer.joints, np.float32), len(model.parents)
+    sound, pose, last = _sound(g, count)
+    chain = _chain(g, g.reshape(g.slice(pose, 2, 0, 9 * count), count, 3, 3), joints, np.array(model.parents))
+    places = g.reshape(_places(g, chain, joints), 1, 3 * count)
+    frames = g("Concat", g("Concat", pose, places, axis=2), "history", axis=1)
+    g.slice(frames, 1, 0, 2, "next_history")
+    inputs, order = _inputs(g, frames, last, joints[model.kept[0]], model)
     inputs = g("Sub", inputs, np.asarray(network.pose_mean)[order])
     bounds = network.pose_bounds
     inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
     latent, strayed = predicted(g, inputs, model, order)
     slack = np.concatenate([np.asarray(bounds.slack)[order], np.asarray(network.code_bounds.slack)])
-    fine = g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack[None])
-    fine = _all(g, fine)
-    g("And", g("And", fine, sound), np.array([[bool(wearer.known)]]), name="ok_column")
-    g("Reshape", "ok_column", np.array([-1], np.int64), name="ok")
+    fine = g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack)
+    least = g("ReduceMin", g("Cast", fine, to=onnx.TensorProto.FLOAT), axes=[1], keepdims=0)
+    fine = g("Greater", least, np.float32(0.5 if wearer.known else 2.0))
+    g("And", fine, g("Reshape", sound, np.array([-1], np.int64)), name="ok")
 
     vertices = len(wearer.template[0])
     if output != "none":
         template = np.asarray(wearer.template).reshape(-1)
         garment = g.even(shape_weights(g, latent, model), _weight_limits(model), Layer(network.shapes, template))
         if output == "world":
-            _skin(g, garment, chain, translation, model, vertices)
+            _skin(g, garment, chain, g.slice(pose, 2, 9 * count, 9 * count + 3), model, vertices)
         else:
             g("Transpose", g.reshape(garment, 3, vertices), perm=[0, 2, 1], name="vertices")
 
     number = "N" if batch is None else batch
-    widths = {
-        "latent": (len(network.first),),
-        "rotations": (2, count, 3, 3),
-        "positions": (2, count, 3),
-        "translations": (2, 3),
-    }
 
-    def described(name: str, *shape: int):
-        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, (number, *shape))
+    def described(**shapes: tuple[int, ...]) -> list:
+        float32 = onnx.TensorProto.FLOAT
+        return [onnx.helper.make_tensor_value_info(x, float32, (number, *shape)) for x, shape in shapes.items()]
 
-    before = [described(name, *widths[name.removeprefix("previous_")]) for name in STATE]
-    after = [described(name, *widths[name.removeprefix("next_")]) for name in FOLLOWING[:-1]]
-    after.append(onnx.helper.make_tensor_value_info("ok", onnx.TensorProto.BOOL, (number,)))
-    pose = [described("rotations", count, 3, 3), described("translation", 3)]
-    shown = [] if output == "none" else [described("vertices", vertices, 3)]
-    return onnx.helper.make_graph(g.nodes, "clothjax", [*before, *pose], [*after, *shown], g.constants)
-
-
-def _all(g: Graph, flags: str) -> str:
-    """[N, 1] whether all of bools [N, n] hold."""
-    import onnx
-
-    least = g("ReduceMin", g("Cast", flags, to=onnx.TensorProto.FLOAT), axes=[1], keepdims=1)
-    return g("Greater", least, np.array([[0.5]], np.float32))
+    latent, history = (len(network.first),), (2, 12 * count + 3)
+    given = described(latent=latent, history=history, rotations=(count, 3, 3), translation=(3,))
+    following = described(next_latent=latent, next_history=history)
+    following.append(onnx.helper.make_tensor_value_info("ok", onnx.TensorProto.BOOL, (number,)))
+    shown = [] if output == "none" else described(vertices=(vertices, 3))
+    return onnx.helper.make_graph(g.nodes, "clothjax", given, following + shown, g.constants)
 
 
 def _sound(g: Graph, count: int) -> tuple[str, str, str]:
-    """Whether the pose is finite [N, 1]; and its rotations [N, 9 J] and translation [N, 3], or the last ones."""
-    flat = g.reshape("rotations", 9 * count)
-    # NaN is not less than anything
-    near = g("Mul", "translation", np.float32(2.0 / inference.FARTHEST))
-    sound = _all(g, g("Less", g("Abs", g("Concat", flat, near, axis=1)), np.float32(2.0)))
-    rows = []
-    for new, name, size in ((flat, "previous_rotations", 9 * count), ("translation", "previous_translations", 3)):
-        rows.append(g("Where", sound, new, g.slice(g.reshape(name, 2 * size), 1, 0, size)))
-    return sound, *rows
+    """Whether the pose is finite [N, 1, 1]; its rotations and translation [N, 1, 9 J + 3], or the last ones, which
+    come third."""
+    import onnx
+
+    given = g("Concat", g.reshape("rotations", 1, 9 * count), g.reshape("translation", 1, 3), axis=2)
+    last = g.slice(g.slice("history", 1, 0, 1), 2, 0, 9 * count + 3)
+    limits = np.repeat([2.0, inference.FARTHEST], [9 * count, 3]).astype(np.float32)
+    near = g("Less", g("Abs", given), limits)  # NaN is not less than anything
+    least = g("ReduceMin", g("Cast", near, to=onnx.TensorProto.FLOAT), axes=[2], keepdims=1)
+    sound = g("Greater", least, np.float32(0.5))
+    return sound, g("Where", sound, given, last), last
 
 
 def _chain(g: Graph, local: str, joints: Array, parents: Array) -> str:
@@ -259,39 +245,40 @@ def _places(g: Graph, chain: str, joints: Array) -> str:
     return g("ReduceSum", g("Mul", part, homogeneous[None, :, None]), np.array([3], np.int64), keepdims=0)
 
 
-def _inputs(
-    g: Graph, rotations: str, positions: str, translations: str, origin: Array, model: Model
-) -> tuple[str, np.ndarray]:
-    """The inputs [N, P] of `latent_predictor.pose_inputs`, in another order, and for each its place in that."""
-    root, others = model.kept[0], np.array(model.kept[1:], np.int64)
+def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tuple[str, np.ndarray]:
+    """The inputs [N, P] of `latent_predictor.pose_inputs`, in another order, and for each its place in that.
+
+    Args:
+        frames: [N, 3, 12 J + 3] rows of the history, the new one first.
+        last: the row of the frame before, or its beginning.
+    """
+    count, root, others = len(model.parents), model.kept[0], np.array(model.kept[1:])
     seen = len(others)
-    facing = g.slice(g.reshape("previous_rotations", 18 * len(model.parents)), 1, 9 * root, 9 * root + 9)
     # cosine and sine of the heading, times something: r00 + r22 and r02 - r20
     pick = np.zeros((9, 2), np.float32)
     pick[[0, 8], 0], pick[2, 1], pick[6, 1] = 1.0, 1.0, -1.0
-    direction = g("MatMul", facing, pick)
-    short = g("Less", g("ReduceSumSquare", direction, axes=[1], keepdims=1), np.float32(1e-12))
-    direction = g("Where", short, np.array([[1.0, 0.0]], np.float32), direction)
-    direction = g("Div", direction, g("ReduceL2", direction, axes=[1], keepdims=1))
-    spread = np.zeros((2, 9), np.float32)
-    spread[0, [0, 8]], spread[1, 2], spread[1, 6] = 1.0, 1.0, -1.0
-    up = np.zeros((1, 9), np.float32)
-    up[0, 4] = 1.0
+    direction = g("MatMul", g.slice(last, 2, 9 * root, 9 * root + 9), pick)
+    short = g("Less", g("ReduceSumSquare", direction, axes=[2], keepdims=1), np.float32(1e-12))
+    direction = g("Where", short, np.array([1.0, 0.0], np.float32), direction)
+    direction = g("Div", direction, g("ReduceL2", direction, axes=[2], keepdims=1))
+    spread, up = np.zeros((2, 9), np.float32), np.zeros(9, np.float32)
+    spread[0, [0, 8]], spread[1, 2], spread[1, 6], up[4] = 1.0, 1.0, -1.0, 1.0
     heading = g.reshape(g("Add", g("MatMul", direction, spread), up), 3, 3)
 
-    steps = g("MatMul", np.float32(model.config.fps) * np.array([[1, -1, 0], [0, 1, -1]], np.float32), translations)
-    columns = g("Slice", g("Gather", rotations, np.int64(root), axis=2), *(np.array([x], np.int64) for x in (0, 2, 3)))
-    columns = g.reshape(g("Transpose", columns, perm=[0, 1, 3, 2]), 6, 3)
-    relative = g("Sub", g("Gather", positions, others, axis=2), origin[None, None, None])
+    difference = np.float32(model.config.fps) * np.array([[1, -1, 0], [0, 1, -1]], np.float32)
+    steps = g("MatMul", difference, g.slice(frames, 2, 9 * count, 9 * count + 3))
+    of_columns = np.array([0, 3, 6, 1, 4, 7])  # of a matrix, row by row
+    columns = g.reshape(g("Gather", frames, 9 * root + of_columns, axis=2), 6, 3)
+    places = (9 * count + 3 + 3 * others[:, None] + np.arange(3)).reshape(-1)
+    relative = g("Sub", g("Gather", frames, places, axis=2), np.tile(origin, seen))
     vectors = g("Concat", steps, columns, g.reshape(relative, 3 * seen, 3), axis=1)
     turned = g.reshape(g("MatMul", vectors, heading), 3 * (2 + 6 + 3 * seen))
-    codes = g("Slice", g("Gather", rotations, others, axis=2), *(np.array([x], np.int64) for x in (0, 2, 4)))
-    codes = g.reshape(codes, 18 * seen)
+    codes = g.reshape(g("Gather", frames, (9 * others[:, None] + of_columns).reshape(-1), axis=2), 18 * seen)
 
     place = np.arange(6 + 18 * (seen + 1) + 9 * seen)
     velocity, rows, apart = np.split(place, [6, 6 + 18 * (seen + 1)])
-    rows = rows.reshape(3, seen + 1, 2, 3)  # frames, joints, columns, rows of the rotation
-    order = [velocity, rows[:, 0].reshape(-1), apart, rows[:, 1:].transpose(0, 1, 3, 2).reshape(-1)]
+    rows = rows.reshape(3, seen + 1, 6)  # frames, joints, two columns
+    order = [velocity, rows[:, 0].reshape(-1), apart, rows[:, 1:].reshape(-1)]
     return g("Concat", turned, codes, axis=1), np.concatenate(order)
 
 

@@ -14,6 +14,11 @@ VERTICES = {
     "canonical": "in the canonical pose, m, as are joint_positions: skin them with skin_weights [V, skin_joints]",
     "none": "none: the state goes on unseen",
 }
+STATE = {
+    "state": "feed next_latent and next_history back",
+    "first_state": "latent is first_latent. Run once with the first pose and any finite history; the first row of "
+    "next_history, twice, is the history of a character that has been standing in that pose",
+}
 
 
 def write(model: Model, path: Path, output: Output, about: dict) -> None:
@@ -34,10 +39,6 @@ def write(model: Model, path: Path, output: Output, about: dict) -> None:
         "normalisation": "inside the model: give poses as they are",
         "ok": "false where the pose, the wearer or the code was outside the range of training and was brought into it",
         "vertices": VERTICES[output],
-        "state": "feed next_* back as latent and previous_*, of which entry 0 is the newest pose",
-        "first_state": "latent is first_latent. Run once with the first pose, which is also both entries of "
-        "previous_rotations and previous_translations, and previous_positions of zeros; then copy entry 0 of "
-        "next_positions to both entries of previous_positions, and set latent to first_latent again",
         "first_latent": np.asarray(model.network.first).tolist(),
         "faces": np.asarray(model.faces).tolist(),
     } | about

@@ -50,7 +50,16 @@ def to_stablehlo(model: Model, path: str | Path, about: dict | None = None) -> P
     arguments = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     exported = jax.export.export(jax.jit(frame), platforms=("cpu", "cuda", "tpu"))(*arguments)
     path.write_bytes(exported.serialize())
-    sidecar.write(model, path, "world", about or {})
+    names = ("latent", "previous_rotations", "previous_positions", "previous_translations", "rotations", "translation")
+    told = {
+        "arguments": {name: list(shape) for name, shape in zip(names, shapes)},
+        "results": ["latent", "rotations", "positions", "translations", "ok", "vertices"],
+        "state": "feed the first four results back; of previous_*, entry 0 is the newest frame",
+        "first_state": "latent is first_latent. Run once with the first pose, which is also both entries of "
+        "previous_rotations and previous_translations; entry 0 of the positions that come back, twice, is "
+        "previous_positions",
+    }
+    sidecar.write(model, path, "world", told | (about or {}))
     return path
 
 
