@@ -292,6 +292,18 @@ def _skin(garment: Array, weights: Array, transforms: Array, translation: Array)
 
 
 @jax.jit
+def resting(before: State, after: State, tolerance: float = 1e-3) -> Array:
+    """Whether a step has changed nothing, bool: until the pose changes, no other need be taken.
+
+    Args:
+        before, after: the states around the step.
+        tolerance: of the code, in standard deviations; a tenth of it, in rad and m, of the poses.
+    """
+    still = [jnp.max(jnp.abs(x[0] - x[1])) < 0.1 * tolerance for x in (after.rotations, after.translation)]
+    return still[0] & still[1] & (jnp.max(jnp.abs(after.latent - before.latent)) < tolerance)
+
+
+@jax.jit
 def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
     """`step` for every character of a `crowd`: states and poses have a leading axis [N], and so have the vertices."""
     return jax.vmap(partial(step, vertices=True), (_axes(model), 0, 0))(model, states, poses)

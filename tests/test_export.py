@@ -1,7 +1,9 @@
 """What other runtimes make of a model is what jax makes of it."""
 
 import json
+import subprocess
 import sys
+import venv
 
 import jax.numpy as jnp
 import numpy as np
@@ -123,6 +125,41 @@ def test_the_first_state_as_the_json_says(model, motion, tmp_path):
     state = [latent, np.repeat(found[:, :1], 2, axis=1)]
     for mine, theirs in zip(state, onnx.first_state(model, Pose(turn[0], place[0]))):
         np.testing.assert_allclose(mine, theirs, atol=1e-6)
+
+
+OLD = """
+import sys
+import numpy as np
+import onnxruntime
+
+given = np.load(sys.argv[2])
+run = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
+state, vertices = [given["latent"], given["history"]], []
+for rotations, translation in zip(given["rotations"][:, None], given["translation"][:, None]):
+    names = ("latent", "history", "rotations", "translation")
+    *state, ok, shown = run.run(None, dict(zip(names, (*state, rotations, translation))))
+    vertices.append(shown[0])
+np.save(sys.argv[3], np.stack(vertices))
+print(onnxruntime.__version__)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.version_info >= (3, 12), reason="ONNX Runtime 1.15 is for Python 3.11 at the most")
+@pytest.mark.parametrize("int8", [False, True])
+def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
+    venv.create(tmp_path / "old", with_pip=True)
+    python = tmp_path / "old" / "bin" / "python"
+    subprocess.run([python, "-m", "pip", "install", "-q", "onnxruntime==1.15.1", "numpy<2"], check=True)
+    motion = convert.validation(model)
+    latent, history = onnx.first_state(model, Pose(motion.rotations[0], motion.translation[0]))
+    given, found = tmp_path / "given.npz", tmp_path / "found.npy"
+    rotations, translation = (np.asarray(x, np.float32) for x in motion[:2])
+    np.savez(given, latent=latent, history=history, rotations=rotations, translation=translation)
+    path = onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
+    done = subprocess.run([python, "-c", OLD, path, given, found], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "1.15.1" and len(np.load(found)) == 300
+    assert apart(np.load(found), model, motion).max() < (4e-3 if int8 else 1e-4)
 
 
 def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import experiment, inference, latent_predictor, stage1, stage2
+from clothjax import experiment, inference, latent_predictor, stage1, stage2, storage
 from clothjax.types import Material, Motion, Pose
 
 
@@ -83,6 +83,26 @@ def test_a_garment_that_nobody_sees_goes_on(trained):
     unseen, nothing = inference.step(model, state, pose, vertices=False)
     assert vertices is not None and nothing is None
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), seen, unseen)
+
+
+def test_a_garment_at_rest_can_be_left_alone():
+    model = inference.load("skirt")
+    clip = storage.load_motion("walk_3", model.names)
+    poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
+    state = inference.initial_state(model, poses[0])
+    for pose in poses:
+        before = state
+        state, _ = inference.step(model, state, pose)
+        assert not inference.resting(before, state)
+    frames = 0
+    while not inference.resting(before, state):
+        before, frames = state, frames + 1
+        state, frozen = inference.step(model, state, poses[-1])
+        assert frames < 300
+    assert frames > 2
+    for _ in range(300):
+        state, vertices = inference.step(model, state, poses[-1])
+    np.testing.assert_allclose(vertices, frozen, atol=2e-4)
 
 
 def test_psi_does_not_see_place_or_heading(trained):
