@@ -1,9 +1,11 @@
 """What other runtimes make of a model is what jax makes of it."""
 
 import json
+import shutil
 import subprocess
 import sys
 import venv
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -160,6 +162,24 @@ def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
     done = subprocess.run([python, "-c", OLD, path, given, found], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "1.15.1" and len(np.load(found)) == 300
     assert apart(np.load(found), model, motion).max() < (4e-3 if int8 else 1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npm") is None, reason="needs Node")
+def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
+    subprocess.run(["npm", "install", "--silent", "onnxruntime-web"], check=True, cwd=tmp_path)
+    shutil.copy(Path(convert.__file__).parent / "deploy" / "psi.mjs", tmp_path)
+    motion = convert.validation(model)
+    rotations = np.asarray(motion.rotations).reshape(len(motion.rotations), -1)
+    given = {"rotations": rotations.tolist(), "translation": motion.translation.tolist()}
+    (tmp_path / "motion.json").write_text(json.dumps(given))
+    for int8, most in ((False, 1e-4), (True, 4e-3)):
+        onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
+        command = ["node", "psi.mjs", "g.onnx", "motion.json", "vertices.bin"]
+        done = subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, text=True)
+        assert "ms a frame, one thread of WebAssembly" in done.stdout
+        found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(300, -1, 3)
+        assert apart(found, model, motion).max() < most
 
 
 def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
