@@ -36,7 +36,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--to", choices=["onnx", "stablehlo", "safetensors"], default="onnx")
     parser.add_argument("--out", type=Path, default=None, help="default: GARMENT.onnx and so on, in the run's folder")
     parser.add_argument("--int8", action="store_true")
-    parser.add_argument("--batch", default="1", help="characters a call, or dynamic")
+    parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
     parser.add_argument("--output", choices=["world", "canonical", "none"], default="world")
     parser.add_argument("--blendshapes", type=int, default=None)
     parser.add_argument("--max_influences", type=int, default=None)
@@ -45,14 +45,22 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     if (arguments.run is None) == (arguments.pretrained is None):
         raise ValueError("give the folder of a run, or --pretrained with the name of a garment")
-    if arguments.to != "onnx" and (arguments.int8 or arguments.batch != "1" or arguments.output != "world"):
+    if arguments.to != "onnx" and (arguments.int8 or arguments.batch != 1 or arguments.output != "world"):
         raise ValueError(f"--int8, --batch and --output are of ONNX, not of {arguments.to}")
     run = arguments.run or trained.folder(arguments.pretrained)
-    betas = None if arguments.betas is None else np.array(arguments.betas + [0.0] * (10 - len(arguments.betas)))
+    betas = None
+    if arguments.betas is not None:
+        count = storage.load_body(trained.psi(run)[0].body).shapedirs.shape[-1]
+        betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
     material = None if arguments.material is None else Material(*arguments.material)
     model = inference.load(run, betas=betas, material=material)
     out = arguments.out or (arguments.run or Path(".")) / f"{model.config.garment}.{arguments.to}"
     convert(model, out, arguments)
+
+
+def _batch(given: str) -> int | None:
+    """Characters a call, None for any number."""
+    return None if given == "dynamic" else int(given)
 
 
 def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
@@ -62,8 +70,7 @@ def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
     motion = validation(model)
     out.parent.mkdir(parents=True, exist_ok=True)
     if arguments.to == "onnx":
-        batch = None if arguments.batch == "dynamic" else int(arguments.batch)
-        onnx.to_onnx(small, out, batch=batch, int8=arguments.int8, output=arguments.output, about=about)
+        onnx.to_onnx(small, out, batch=arguments.batch, int8=arguments.int8, output=arguments.output, about=about)
         found = onnx.run_onnx(out, small, motion) if arguments.output == "world" else None
     elif arguments.to == "stablehlo":
         stablehlo.to_stablehlo(small, out, about)
