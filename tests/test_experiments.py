@@ -59,7 +59,7 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
     assert Image.open(finished / "comparison.png").size[0] > 1000
     assert Image.open(finished / "walk.webp").n_frames == 6
     assert (finished / "tshirt.glb").stat().st_size > 10_000
-    assert json.loads((finished / "tshirt.json").read_text())["inputs"]["rotations"] == [31, 3, 3]
+    assert json.loads((finished / "tshirt.json").read_text())["shapes"]["rotations"] == [1, 31, 3, 3]
 
 
 def test_a_finished_run_is_not_trained_again(finished):

@@ -108,7 +108,8 @@ def test_fewer_blend_shapes_err_less_the_more_there_are(kind, wide, motion):
         assert len(fewer.network.shapes) == count
         errors.append(apart(model, fewer, clip).mean())
     assert errors[0] > errors[1] > errors[2]
-    assert errors[2] < 0.005 * errors[0] if kind == "skip" else errors[2] < 0.5 * errors[0]
+    # the weakest of 384 components is less than a tenth of a millimetre, that of a dozen is not
+    assert errors[2] < (1e-4 if kind == "skip" else 0.5 * errors[0])
     # those of the library would leave out more
     cut = dataclasses.replace(
         model, network=model.network._replace(shapes=model.network.shapes.at[all_of_them // 2 :].set(0.0))
