@@ -10,7 +10,7 @@ from clothjax import configuration, experiment, stage1
 from clothjax.config import Config
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
-ALIKE = ("pants", "skirt", "dress")  # like the quickstart: the same program on another mesh
+ALIKE = ("pants", "skirt", "dress", "protocol")  # like the quickstart: the same program on another mesh
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,7 @@ def test_the_descent_goes_further_with_the_hessian_of_cloth_that_is_worn():
     assert np.mean(np.log(worn / at_rest)) < 0
 
 
+@pytest.mark.slow
 def test_loops_that_all_blow_up_are_reported():
     config = small()
     config = dataclasses.replace(
