@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import proximity, skinning
-from clothjax.inference import Bounds, Layer, Model, Network, blend_weights
-from clothjax.types import Array, Garment
+from clothjax import proximity, skinning, storage
+from clothjax.inference import Bounds, Layer, Model, Network, blend_weights, initial_state, step
+from clothjax.types import Array, Garment, Motion, Pose
 
 WORTH = 0.75  # of the weights of the layers around the code, that folding it away must leave at the most
-SAMPLES = 2048  # codes that tell which displacements occur
+CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # that tell which displacements occur
+SAMPLES = 2048  # codes that do, where these do not fit
 
 
 def specialise(model: Model, *, blendshapes: int | None = None, max_influences: int | None = None) -> Model:
@@ -115,11 +116,27 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
 
 
 def ordinary_weights(model: Model) -> np.ndarray:
-    """Blend-shape weights [n, K] of random codes; these are normalised, so that ordinary ones have unit deviation."""
+    """Blend-shape weights [n, K] of closed loops over embedded clips; of random codes, for a body they do not fit."""
     limits = model.network.code_bounds
-    codes = jax.random.normal(jax.random.key(0), (SAMPLES, len(limits.low)))
-    codes = jnp.clip(codes, limits.low[None], limits.high[None])
+    try:
+        clips = [storage.load_motion(name, model.names) for name in CLIPS]
+        codes = jnp.concatenate([_codes(model, clip) for clip in clips])
+    except ValueError:
+        codes = jax.random.normal(jax.random.key(0), (SAMPLES, len(limits.low)))
+        codes = jnp.clip(codes, limits.low[None], limits.high[None])
     return np.asarray(jax.vmap(lambda code: blend_weights(model.network, code, model.config))(codes))
+
+
+@jax.jit
+def _codes(model: Model, motion: Motion) -> Array:
+    """The codes [T, C] of a closed loop."""
+    poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
+
+    def frame(state, pose):
+        state, _ = step(model, state, pose, vertices=False)
+        return state, state.latent
+
+    return jax.lax.scan(frame, initial_state(model, jax.tree.map(lambda x: x[0], poses)), poses)[1]
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -131,8 +148,8 @@ def _rows(network: Network) -> Array:
 
 
 def _fewer_shapes(model: Model, count: int) -> Model:
-    """Principal components of the displacements of random codes in the place of the blend shapes; their mean goes
-    into the template."""
+    """Principal components of ordinary displacements in the place of the blend shapes; their mean goes into the
+    template."""
     network, weights = model.network, ordinary_weights(model).astype(np.float64)
     mean, spread = weights.mean(axis=0), np.cov(weights.T)
     root = np.linalg.cholesky(spread + 1e-9 * np.trace(spread) / len(mean) * np.eye(len(mean)))

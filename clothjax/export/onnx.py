@@ -324,8 +324,6 @@ def shape_weights(g: Graph, latent: str, model: Model) -> str:
 
 def _weight_limits(model: Model) -> np.ndarray:
     """[K] how large the weights become."""
-    if model.network.code.kernel is None:  # codes to try are not normalised
-        return np.ones(len(model.network.shapes))
     return np.abs(folding.ordinary_weights(model)).max(axis=0)
 
 
