@@ -74,11 +74,7 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
     plain = paper_model()
     folded = folding.specialise(plain)
     vertices = plain.wearer.template.shape[1]
-    forms = {
-        "plain": plain,
-        "folded": folded,
-        "three quarters of the shapes": folding.specialise(plain, blendshapes=3 * len(plain.network.shapes) // 4),
-    }
+    forms = {"plain": plain, "folded": folded} | _fewer(plain)
     calls, size, kinds = {}, {}, {}
     for name, model in forms.items():
         for int8 in (False, True):
@@ -117,8 +113,8 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     motion = Motion(clip.rotations, (clip.translation - clip.translation[:1]).astype(np.float32), clip.fps)
     reference = np.asarray(inference.animate(model, motion)[0])
     forms = {"plain": model, "folded": folding.specialise(model)}
-    forms["three quarters of the shapes"] = folding.specialise(model, blendshapes=3 * len(model.network.shapes) // 4)
-    forms |= {f"{count} shapes": folding.specialise(model, blendshapes=count) for count in (192, 128, 64)}
+    forms |= _fewer(model)
+    forms |= {f"{count} shapes": folding.specialise(model, blendshapes=count) for count in (192, 32)}
     forms["4 influences"] = folding.specialise(model, max_influences=4)
     calls, found = {}, {}
     for name, form in forms.items():
@@ -128,7 +124,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
             kind = f"{name}, int8" if int8 else name
             calls[kind] = onnx_call(path, form)
             found[kind] = (error, path.stat().st_size, True)
-        if name in ("plain", "folded", "128 shapes"):
+        if name in ("plain", "folded", "a third of the shapes"):
             error = np.linalg.norm(np.asarray(inference.animate(form, motion)[0]) - reference, axis=-1)
             calls[f"jax: {name}"] = jax_call(form)
             found[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), False)
@@ -230,6 +226,12 @@ def jax_call(model: Model, vertices: bool = True) -> Call:
 def _pose(model: Model) -> Pose:
     clip = storage.load_motion("walk_3", model.names)
     return Pose(jnp.asarray(clip.rotations[0]), jnp.asarray(clip.translation[0], jnp.float32))
+
+
+def _fewer(model: Model) -> dict[str, Model]:
+    parts = {"three quarters": 0.75, "a third": 1 / 3, "a sixth": 1 / 6}
+    count = len(model.network.shapes)
+    return {f"{name} of the shapes": folding.specialise(model, blendshapes=int(x * count)) for name, x in parts.items()}
 
 
 def _network(model: Model, path: Path, int8: bool) -> Path:
