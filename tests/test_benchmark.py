@@ -80,7 +80,7 @@ def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):
     run = ncs.session(path)
     still = {name: 0 * x if name in ("dynamic", "hidden") else x for name, x in given.items()}
     hidden, vertices = run.run(["next_hidden", "vertices"], still)
-    assert (hidden == 0).all() and vertices.shape == (4424, 3) and np.isfinite(vertices).all()
+    assert (hidden == 0).all() and vertices.shape == (1, 4424, 3) and np.isfinite(vertices).all()
     moved, others = run.run(["next_hidden", "vertices"], given)
     assert 0 < np.abs(moved).max() and np.abs(others - vertices).max() > 1e-3
     small = ncs.write(tmp_path / "network.onnx", 4424, int8=True, whole=False)

@@ -15,6 +15,7 @@ from toy import small
 import clothjax as cj
 from clothjax import folding, inference, skinning, storage
 from clothjax.export import onnx, safetensors, stablehlo
+from clothjax.export.onnx_graph import session
 from clothjax.types import Motion, Pose
 from experiments import convert
 
@@ -55,7 +56,7 @@ def test_onnx_of_a_folded_code_and_of_a_relu(motion, tmp_path):
 
 
 def test_onnx_takes_wild_input_as_the_model_does(model, motion, tmp_path):
-    run = onnx.session(onnx.to_onnx(model, tmp_path / "g.onnx"))
+    run = session(onnx.to_onnx(model, tmp_path / "g.onnx"))
     rotations, translation = np.array(motion.rotations[:12]), np.array(motion.translation[:12])
     rotations[4, 3, 1, 1] = np.nan
     translation[7] = np.inf
@@ -84,7 +85,7 @@ def test_int8_is_small_and_near(model, motion, tmp_path):
 
 @pytest.mark.parametrize("batch", [3, None])
 def test_onnx_of_many_characters(batch, model, motion, tmp_path):
-    run = onnx.session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=batch))
+    run = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=batch))
     pose = Pose(np.asarray(motion.rotations[20:23], np.float32), motion.translation[20:23])
     states = [onnx.first_state(model, Pose(pose.rotations[i], pose.translation[i])) for i in range(3)]
     together = [np.concatenate(parts) for parts in zip(*states)]
@@ -98,9 +99,9 @@ def test_onnx_of_many_characters(batch, model, motion, tmp_path):
 def test_an_engine_can_skin_the_garment_and_need_not_see_it(model, motion, tmp_path):
     pose = Pose(np.asarray(motion.rotations[5], np.float32), motion.translation[5])
     feed = dict(zip(onnx.INPUTS, (*onnx.first_state(model, pose), pose.rotations[None], pose.translation[None])))
-    shown = onnx.session(onnx.to_onnx(model, tmp_path / "w.onnx")).run(None, feed)
+    shown = session(onnx.to_onnx(model, tmp_path / "w.onnx")).run(None, feed)
     canonical = onnx.to_onnx(folding.specialise(model), tmp_path / "c.onnx", output="canonical")
-    *state, vertices = onnx.session(canonical).run(None, feed)
+    *state, vertices = session(canonical).run(None, feed)
     told = json.loads(canonical.with_suffix(".json").read_text())
     transforms = skinning.joint_transforms(
         jnp.asarray(pose.rotations), jnp.asarray(told["joint_positions"]), np.array(told["parents"])
@@ -108,7 +109,7 @@ def test_an_engine_can_skin_the_garment_and_need_not_see_it(model, motion, tmp_p
     blended = skinning.blend(jnp.asarray(told["skin_weights"]), transforms[np.array(told["skin_joints"])])
     placed = skinning.apply(blended, jnp.asarray(vertices[0])) + pose.translation[None]
     np.testing.assert_allclose(placed, shown[-1][0], atol=1e-4)
-    unseen = onnx.session(onnx.to_onnx(model, tmp_path / "n.onnx", output="none")).run(None, feed)
+    unseen = session(onnx.to_onnx(model, tmp_path / "n.onnx", output="none")).run(None, feed)
     assert len(unseen) == len(shown) - 1
     for one, other, same in zip(shown, unseen, state):
         np.testing.assert_allclose(one, other, atol=1e-5)
@@ -119,7 +120,7 @@ def test_the_first_state_as_the_json_says(model, motion, tmp_path):
     path = onnx.to_onnx(model, tmp_path / "g.onnx")
     told = json.loads(path.with_suffix(".json").read_text())
     assert told["joints"][0] and len(told["joints"]) == len(told["parents"]) and told["fps"] == 30.0
-    run = onnx.session(path)
+    run = session(path)
     turn, place = np.asarray(motion.rotations[:1], np.float32), motion.translation[:1]
     latent = np.asarray(told["first_latent"], np.float32)[None]
     anything = np.ones(told["shapes"]["history"], np.float32)

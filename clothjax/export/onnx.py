@@ -1,21 +1,19 @@
 """ONNX: one frame of a model as a small graph of standard operators, with the state as plain tensors.
 
 The graph is written out, not traced: a frame takes microseconds, and every operator of a runtime costs about one.
-Opset 17 and IR 8 are the newest that ONNX Runtime 1.15, still in engines, loads.
 """
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from clothjax import folding, inference
 from clothjax.export import sidecar
+from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
 from clothjax.inference import Layer, Model
 from clothjax.types import Array, Motion, Pose
 
-OPSET, IR_VERSION = 17, 8
 INPUTS = ("latent", "history", "rotations", "translation")
 FOLLOWING = ("next_latent", "next_history", "ok")
 
@@ -45,25 +43,11 @@ def to_onnx(
     Raises:
         ImportError: if the extra `export` is not installed.
     """
-    try:
-        import onnx
-    except ImportError as error:
-        raise ImportError("ONNX export needs onnx: pip install clothjax[export]") from error
     path = Path(path)
-    graph = _frame(model, batch, int8, output)
-    made = onnx.helper.make_model(
-        graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)], producer_name="clothjax", ir_version=IR_VERSION
-    )
-    onnx.checker.check_model(made, full_check=True)
-    if int8:
-        quantise(made, path)
-    else:
-        onnx.save(made, str(path))
-    shapes = {
-        value.name: [dim.dim_param or dim.dim_value for dim in value.type.tensor_type.shape.dim]
-        for value in (*graph.input, *graph.output)
-    }
-    sidecar.write(model, path, output, sidecar.STATE | {"shapes": shapes} | (about or {}))
+    given, following, graph = _frame(model, "N" if batch is None else batch, int8, output)
+    graph.save(path, given, following, flags=("ok",))
+    shapes = {"shapes": {name: list(shape) for name, shape in (given | following).items()}}
+    sidecar.write(model, path, output, sidecar.STATE | shapes | (about or {}))
     return path
 
 
@@ -97,71 +81,8 @@ def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     return np.stack(vertices)
 
 
-def session(path: str | Path):
-    """An ONNX Runtime session of a file, on one thread."""
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise ImportError("running ONNX needs onnxruntime: pip install clothjax[export]") from error
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-
-
-class Graph:
-    """Nodes and constants of a graph under construction."""
-
-    def __init__(self, int8: bool = False):
-        self.nodes, self.constants, self.int8 = [], [], int8
-
-    def __call__(self, operator: str, *inputs: str | Array, name: str | None = None, **attributes) -> str:
-        """Adds a node; arrays among its inputs become constants. Returns the name of its output."""
-        import onnx
-
-        inputs = [x if isinstance(x, str) else self.constant(x) for x in inputs]
-        name = name or f"{operator.lower()}_{len(self.nodes)}"
-        self.nodes.append(onnx.helper.make_node(operator, inputs, [name], name=name, **attributes))
-        return name
-
-    def constant(self, array: Array) -> str:
-        import onnx
-
-        array = np.asarray(array)
-        if array.dtype == np.float64:
-            array = array.astype(np.float32)
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(onnx.numpy_helper.from_array(np.asarray(array, order="C"), name))
-        return name
-
-    def reshape(self, x: str, *shape: int) -> str:
-        # zero keeps the axis of characters
-        return self("Reshape", x, np.array((0, *shape), np.int64))
-
-    def slice(self, x: str, axis: int, start: int, end: int, name: str | None = None) -> str:
-        return self("Slice", x, *(np.array([i], np.int64) for i in (start, end, axis)), name=name)
-
-    def within(self, x: str, low: Array, high: Array, name: str | None = None) -> tuple[str, str]:
-        """x brought into [low, high], and how far it was moved."""
-        inside = self("Min", self("Max", x, np.asarray(low)), np.asarray(high), name=name)
-        return inside, self("Abs", self("Sub", inside, x))
-
-    def layer(self, x: str, layer: Layer) -> str:
-        return self("Add", self("MatMul", x, np.asarray(layer.kernel), name=f"dense_{len(self.nodes)}"), layer.bias)
-
-    def even(self, x: str, limits: Array, layer: Layer) -> str:
-        """`layer` of inputs within +-`limits`, both scaled so that no input is small beside the others (Xiao et al.
-        2023): eight bits, where they are used, are shared by all of a row."""
-        kernel = np.asarray(layer.kernel)
-        if not self.int8:
-            return self.layer(x, layer)
-        scale = np.sqrt(np.maximum(limits, 1e-6) / np.maximum(np.abs(kernel).max(axis=1), 1e-6)).astype(np.float32)
-        return self.layer(self("Mul", x, 1.0 / scale), Layer(kernel * scale[:, None], layer.bias))
-
-
-def _frame(model: Model, batch: int | None, int8: bool, output: Output):
-    """The graph of one frame, operator for operator `inference.step`."""
-    import onnx
-
+def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[dict, dict, Graph]:
+    """The inputs, the outputs and the graph of one frame, operator for operator `inference.step`."""
     g, network, wearer = Graph(int8), model.network, model.wearer
     joints, count = np.asarray(wearer.joints, np.float32), len(model.parents)
     sound, pose, last = _sound(g, count)
@@ -175,45 +96,39 @@ def _frame(model: Model, batch: int | None, int8: bool, output: Output):
     inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
     latent, strayed = predicted(g, inputs, model, order)
     slack = np.concatenate([np.asarray(bounds.slack)[order], np.asarray(network.code_bounds.slack)])
-    fine = g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack)
-    least = g("ReduceMin", g("Cast", fine, to=onnx.TensorProto.FLOAT), axes=[1], keepdims=0)
-    fine = g("Greater", least, np.float32(0.5 if wearer.known else 2.0))
-    g("And", fine, g("Reshape", sound, np.array([-1], np.int64)), name="ok")
+    fine = g.all(g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack), axis=1)
+    known = np.array([[bool(wearer.known)]])
+    ok = g("And", g("And", fine, known), g("Reshape", sound, np.array([-1, 1], np.int64)))
+    g("Reshape", ok, np.array([-1], np.int64), name="ok")
 
-    vertices = len(wearer.template[0])
-    if output != "none":
-        template = np.asarray(wearer.template).reshape(-1)
-        garment = g.even(shape_weights(g, latent, model), _weight_limits(model), Layer(network.shapes, template))
-        if output == "world":
-            _skin(g, garment, chain, g.slice(pose, 2, 9 * count, 9 * count + 3), model, vertices)
-        else:
-            g("Transpose", g.reshape(garment, 3, vertices), perm=[0, 2, 1], name="vertices")
-
-    number = "N" if batch is None else batch
-
-    def described(**shapes: tuple[int, ...]) -> list:
-        float32 = onnx.TensorProto.FLOAT
-        return [onnx.helper.make_tensor_value_info(x, float32, (number, *shape)) for x, shape in shapes.items()]
-
-    latent, history = (len(network.first),), (2, 12 * count + 3)
-    given = described(latent=latent, history=history, rotations=(count, 3, 3), translation=(3,))
-    following = described(next_latent=latent, next_history=history)
-    following.append(onnx.helper.make_tensor_value_info("ok", onnx.TensorProto.BOOL, (number,)))
-    shown = [] if output == "none" else described(vertices=(vertices, 3))
-    return onnx.helper.make_graph(g.nodes, "clothjax", given, following + shown, g.constants)
+    latent_shape, history_shape = (batch, len(network.first)), (batch, 2, 12 * count + 3)
+    given = {"latent": latent_shape, "history": history_shape}
+    given |= {"rotations": (batch, count, 3, 3), "translation": (batch, 3)}
+    following = {"next_latent": latent_shape, "next_history": history_shape, "ok": (batch,)}
+    if output == "none":
+        return given, following, g
+    vertices = wearer.template.shape[1]
+    template = np.asarray(wearer.template).reshape(-1)
+    limits = np.abs(folding.ordinary_weights(model)).max(axis=0) if int8 else None
+    garment = g.even(shape_weights(g, latent, model), limits, Layer(network.shapes, template))
+    if output == "world":
+        moving = g("Gather", chain, np.array(model.moving, np.int64), axis=1)
+        transforms = g.slice(g.reshape(moving, len(model.moving), 16), 2, 0, 12)
+        skinned = g.skinned(garment, transforms, network.weights)
+        placed = g("Add", skinned, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
+    else:
+        placed = g.reshape(garment, 3, vertices)
+    g("Transpose", placed, perm=[0, 2, 1], name="vertices")
+    return given, following | {"vertices": (batch, vertices, 3)}, g
 
 
 def _sound(g: Graph, count: int) -> tuple[str, str, str]:
     """Whether the pose is finite [N, 1, 1]; its rotations and translation [N, 1, 9 J + 3], or the last ones, which
     come third."""
-    import onnx
-
     given = g("Concat", g.reshape("rotations", 1, 9 * count), g.reshape("translation", 1, 3), axis=2)
     last = g.slice(g.slice("history", 1, 0, 1), 2, 0, 9 * count + 3)
     limits = np.repeat([2.0, inference.FARTHEST], [9 * count, 3]).astype(np.float32)
-    near = g("Less", g("Abs", given), limits)  # NaN is not less than anything
-    least = g("ReduceMin", g("Cast", near, to=onnx.TensorProto.FLOAT), axes=[2], keepdims=1)
-    sound = g("Greater", least, np.float32(0.5))
+    sound = g.all(g("Less", g("Abs", given), limits), axis=2)  # NaN is not less than anything
     return sound, g("Where", sound, given, last), last
 
 
@@ -320,37 +235,3 @@ def shape_weights(g: Graph, latent: str, model: Model) -> str:
     if model.config.model.blendshape_relu:
         x = g("Relu", x)
     return x if network.mix is None else g.layer(x, network.mix)
-
-
-def _weight_limits(model: Model) -> np.ndarray:
-    """[K] how large the weights become."""
-    return np.abs(folding.ordinary_weights(model)).max(axis=0)
-
-
-def _skin(g: Graph, garment: str, chain: str, translation: str, model: Model, vertices: int) -> None:
-    """`vertices` [N, V, 3], one coordinate after the other until the end."""
-    moving = np.array(model.moving, np.int64)
-    flat = g.slice(g.reshape(g("Gather", chain, moving, axis=1), len(moving), 16), 2, 0, 12)
-    rows = g("MatMul", g("Transpose", flat, perm=[0, 2, 1]), np.asarray(model.network.weights), name="skinning")
-    one_more = np.array([0, 0, 0, 0, 0, 0, 1, 0], np.int64)
-    homogeneous = g("Pad", g.reshape(garment, 1, 3, vertices), one_more, np.float32(1.0))
-    moved = g("Mul", g.reshape(rows, 3, 4, vertices), homogeneous)
-    placed = g("Add", g("ReduceSum", moved, np.array([2], np.int64), keepdims=0), g.reshape(translation, 3, 1))
-    g("Transpose", placed, perm=[0, 2, 1], name="vertices")
-
-
-def quantise(made, path: Path) -> None:
-    """Saves a graph whose dense layers have matrices of eight bits, with a scale for each column."""
-    try:
-        import onnx
-        from onnxruntime.quantization import QuantType, quantize_dynamic
-    except ImportError as error:
-        raise ImportError("int8 needs onnxruntime: pip install clothjax[export]") from error
-    with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / "whole.onnx"
-        onnx.save(made, str(whole))
-        dense = [node.name for node in made.graph.node if node.name.startswith("dense_")]
-        quantize_dynamic(
-            whole, path, weight_type=QuantType.QInt8, per_channel=True, nodes_to_quantize=dense,
-            extra_options={"MatMulConstBOnly": True},
-        )  # fmt: skip

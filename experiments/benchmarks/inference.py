@@ -15,6 +15,7 @@ import onnxruntime
 from clothjax import configuration, experiment, folding, garment_model, inference, latent_predictor, storage
 from clothjax.config import Config
 from clothjax.export import onnx, stablehlo
+from clothjax.export.onnx_graph import Graph, session
 from clothjax.inference import Model
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import Motion, Pose
@@ -204,7 +205,7 @@ def session_call(path: Path) -> Call:
 
 def bound(path: Path, feed: dict[str, np.ndarray]) -> Call:
     """A call that reads and writes buffers of its own, as an engine's does."""
-    run = onnx.session(path)
+    run = session(path)
     binding = run.io_binding()
     for name, value in feed.items():
         binding.bind_cpu_input(name, np.asarray(value, order="C"))
@@ -236,26 +237,12 @@ def _fewer(model: Model) -> dict[str, Model]:
 
 def _network(model: Model, path: Path, int8: bool) -> Path:
     """The predictor and the decoder alone: from pose inputs and code to the next code and the blend-shape weights."""
-    import onnx as library
-
-    g, kind = onnx.Graph(int8), library.TensorProto.FLOAT
+    g = Graph(int8)
     count, size = len(model.network.pose_mean), len(model.network.first)
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
     g("Identity", onnx.shape_weights(g, latent, model), name="weights")
-    described = [
-        [library.helper.make_tensor_value_info(name, kind, (1, width)) for name, width in values.items()]
-        for values in (
-            {"inputs": count, "latent": size},
-            {"next_latent": size, "weights": len(model.network.shapes)},
-        )
-    ]
-    graph = library.helper.make_graph(g.nodes, "network", *described, g.constants)
-    opset = [library.helper.make_opsetid("", onnx.OPSET)]
-    made = library.helper.make_model(graph, opset_imports=opset, ir_version=onnx.IR_VERSION)
-    if int8:
-        onnx.quantise(made, path)
-    else:
-        library.save(made, str(path))
+    given = {"inputs": (1, count), "latent": (1, size)}
+    g.save(path, given, {"next_latent": (1, size), "weights": (1, len(model.network.shapes))})
     return path
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax.export.onnx import IR_VERSION, OPSET, Graph, quantise, session
+from clothjax.export.onnx_graph import Graph, session
 from clothjax.inference import Layer
 
 JOINTS, STATIC, DYNAMIC, WIDTH = 15, 9, 12, 512
@@ -17,16 +17,14 @@ JOINTS, STATIC, DYNAMIC, WIDTH = 15, 9, 12, 512
 
 def write(path: Path, vertices: int, *, int8: bool = False, whole: bool = True) -> Path:
     """Writes the graph for a garment of so many vertices; not `whole`: the network, without shapes and skinning."""
-    import onnx
-
-    random, g = np.random.default_rng(0), Graph()
+    random, g = np.random.default_rng(0), Graph(int8)
 
     def layer(inputs: int, outputs: int) -> Layer:
         kernel = (random.standard_normal((inputs, outputs)) * np.sqrt(2 / inputs)).astype(np.float32)
         return Layer(kernel, np.zeros(outputs, np.float32))
 
     def product(x: str, inputs: int, outputs: int) -> str:
-        return g("MatMul", x, layer(inputs, outputs).kernel, name=f"dense_{len(g.nodes)}")
+        return g.product(x, layer(inputs, outputs).kernel)
 
     x = "static"
     for inputs, outputs in ((JOINTS * STATIC, 64), (64, 128), (128, 256), (256, WIDTH)):
@@ -39,33 +37,18 @@ def write(path: Path, vertices: int, *, int8: bool = False, whole: bool = True) 
     code = g("Add", x, hidden)
     for _ in range(3):
         code = g("Relu", g.layer(code, layer(WIDTH, WIDTH)))
-    floats = {"static": (1, JOINTS * STATIC), "dynamic": (JOINTS, DYNAMIC), "hidden": (1, WIDTH)}
-    results = {"next_hidden": (1, WIDTH)}
+    given = {"static": (1, JOINTS * STATIC), "dynamic": (JOINTS, DYNAMIC), "hidden": (1, WIDTH)}
+    found = {"next_hidden": (1, WIDTH)}
     if whole:
-        floats["transforms"] = (JOINTS, 12)
-        results["vertices"] = (vertices, 3)
+        given["transforms"] = (1, JOINTS, 12)
+        found["vertices"] = (1, vertices, 3)
         garment = g.layer(code, Layer(layer(WIDTH, 3 * vertices).kernel, random.standard_normal(3 * vertices)))
         weights = random.dirichlet(np.ones(JOINTS), vertices).astype(np.float32).T
-        rows = g("MatMul", g("Transpose", "transforms", perm=[1, 0]), weights, name="skinning")
-        one_more = np.array([0, 0, 0, 0, 1, 0], np.int64)
-        homogeneous = g("Pad", g("Reshape", garment, np.array([1, 3, -1], np.int64)), one_more, np.float32(1.0))
-        moved = g("Mul", g("Reshape", rows, np.array([3, 4, -1], np.int64)), homogeneous)
-        g("Transpose", g("ReduceSum", moved, np.array([1], np.int64), keepdims=0), perm=[1, 0], name="vertices")
+        g("Transpose", g.skinned(garment, "transforms", weights), perm=[0, 2, 1], name="vertices")
     else:
-        results["code"] = (1, WIDTH)
+        found["code"] = (1, WIDTH)
         g("Identity", code, name="code")
-    kind = onnx.TensorProto.FLOAT
-    described = [
-        [onnx.helper.make_tensor_value_info(name, kind, shape) for name, shape in values.items()]
-        for values in (floats, results)
-    ]
-    graph = onnx.helper.make_graph(g.nodes, "ncs", *described, g.constants)
-    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    onnx.checker.check_model(made, full_check=True)
-    if int8:
-        quantise(made, path)
-    else:
-        onnx.save(made, str(path))
+    g.save(path, given, found)
     return path
 
 
