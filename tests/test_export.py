@@ -1,5 +1,6 @@
 """What other runtimes make of a model is what jax makes of it."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -72,6 +73,22 @@ def test_onnx_takes_wild_input_as_the_model_does(model, motion, tmp_path):
         assert ok.shape == (1,) and bool(ok[0]) == bool(state.ok)
         told.append(bool(ok[0]))
     assert not told[4] and not told[7] and not told[9] and any(told)
+
+
+def test_onnx_holds_codes_to_their_range_and_says_so(model, motion, tmp_path):
+    pose = Pose(np.asarray(motion.rotations[5], np.float32), motion.translation[5])
+    feed = dict(zip(onnx.INPUTS, (*onnx.first_state(model, pose), pose.rotations[None], pose.translation[None])))
+    bounds = model.network.code_bounds
+    narrow = bounds._replace(low=0 * bounds.low - 0.2, high=0 * bounds.high + 0.2, slack=0 * bounds.slack + 1e-3)
+    strict = dataclasses.replace(model, network=model.network._replace(code_bounds=narrow))
+    stranger = dataclasses.replace(model, wearer=model.wearer._replace(known=jnp.asarray(False)))
+    for name, each, fine in (("usual", model, True), ("strict", strict, False), ("stranger", stranger, False)):
+        run = session(onnx.to_onnx(each, tmp_path / f"{name}.onnx"))
+        latent, ok = run.run(["next_latent", "ok"], feed)
+        expected, _ = inference.step(each, inference.initial_state(each, pose), pose)
+        np.testing.assert_allclose(latent[0], expected.latent, atol=1e-4)
+        assert bool(ok[0]) == bool(expected.ok) == fine
+    assert np.abs(session(tmp_path / "strict.onnx").run(["next_latent"], feed)[0]).max() <= 0.2 + 1e-6
 
 
 def test_int8_is_small_and_near(model, motion, tmp_path):

@@ -163,3 +163,11 @@ def test_a_finer_mesh_moves_with_the_model_and_its_own_mesh_not_at_all(motion):
     plain = skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32))
     rest = cKDTree(np.asarray(model.wearer.template).T).query(np.asarray(plain))[0]
     assert np.percentile(distance, 99) < 1.5 * np.percentile(rest, 99)
+
+
+def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
+    model = cj.load("skirt")
+    garment = storage.load_garment("skirt_4000", storage.load_body(model.config.body))
+    fine = folding.on_mesh(model, garment, np.zeros(10))
+    still = np.abs(np.asarray(fine.network.shapes).reshape(len(fine.network.shapes), 3, -1)).max(axis=(0, 1)) == 0
+    np.testing.assert_array_equal(still, garment.pinned)
