@@ -125,6 +125,7 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
         train.train(trained.phi(run)[0], run)
 
 
+@pytest.mark.slow
 def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solvers(finished):
     config = train.load_phi(finished)[0].config
     settings = dataclasses.replace(config.evaluation, frames=9, betas=0.25)

@@ -79,6 +79,7 @@ def test_beside_the_solver_itself_nothing_differs(walking):
     assert still["swing_ratio"] == 0.0 and still["swing_correlation"] == 0.0
 
 
+@pytest.mark.slow
 def test_all_of_space_contains_the_minimum(walking):
     """With a blend shape for every coordinate the span's minimum is the solver's, with none but one it is not."""
     whole, character, poses = walking

@@ -47,6 +47,7 @@ def flops(whole):
     return counted
 
 
+@pytest.mark.slow
 def test_every_scene_costs_less_than_the_full_one(flops):
     assert set(flops) >= {"flag_on_a_pole", "cloth_on_a_table", "pinned_skirt", "no_friction", "no_bending"}
     full = flops.pop("full")
@@ -175,6 +176,7 @@ def _two_pieces(garment: Garment) -> Garment:
     )
 
 
+@pytest.mark.slow
 def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
     small = garments.build("tshirt", 300, whole.body, whole.names)
     count = len(small.vertices)
