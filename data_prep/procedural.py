@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.storage import canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
-from data_prep.retarget import cmu_names, stand
+from data_prep.retarget import cmu_names, from_t_pose, stand
 
 # cycles per second, before a seed's own factor
 RATES = {"walk": 0.9, "run": 1.35, "jump": 0.5, "arms": 0.35, "twist": 0.4, "dance": 0.8}
@@ -78,16 +78,8 @@ def generate(kind: str, seed: int = 0, seconds: float = 8.0, fps: float = 30.0, 
     standing = canonical_rotation(body)
     body = load_body(body)
 
-    turned = np.zeros((len(pattern.root), len(names), 3, 3))
-    local = {_find(names, j): _matrices(angles) for j, angles in pattern.angles.items()}
-    for j, parent in enumerate(body.parents):
-        turned[:, j] = turned[:, parent] if parent >= 0 else np.eye(3)
-        if j in local:
-            turned[:, j] = turned[:, j] @ local[j]
-    turned = turned @ standing
-    rotations = turned.copy()
-    rotations[:, 1:] = np.swapaxes(turned[:, body.parents[1:]], -1, -2) @ turned[:, 1:]
-
+    local = {names[_find(names, j)]: _matrices(angles) for j, angles in pattern.angles.items()}
+    rotations = from_t_pose(local, body, names, standing)
     motion = Motion(rotations.astype(np.float32), pattern.root - body.joints[0], fps)
     return stand(motion, body)
 

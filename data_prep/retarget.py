@@ -116,9 +116,29 @@ def retarget(
     rotations[:, 1:] = np.swapaxes(world[:, body.parents[1:]], -1, -2) @ world[:, 1:]
 
     places = {name: body.joints[names.index(name)] for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")}
-    scale = _leg(places) / _leg({name: rest[source[name]] for name in places})
+    scale = leg_length(places) / leg_length({name: rest[source[name]] for name in places})
     path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale - body.joints[0]
     return stand(Motion(rotations.astype(np.float32), path, float(fps)), body)
+
+
+def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...], standing: np.ndarray) -> np.ndarray:
+    """Rotations [T, J, 3, 3] of a body's joints from those that turn a T-pose.
+
+    Args:
+        local: [T, 3, 3] by joint name, relative to the parent; joints that are not named go with their parents.
+        names: of the body's joints.
+        standing: [J, 3, 3] of `storage.canonical_rotation`.
+    """
+    frames = len(next(iter(local.values())))
+    turned = np.zeros((frames, len(names), 3, 3))
+    for j, (name, parent) in enumerate(zip(names, body.parents)):
+        turned[:, j] = turned[:, parent] if parent >= 0 else np.eye(3)
+        if name in local:
+            turned[:, j] = turned[:, j] @ local[name]
+    turned = turned @ standing
+    rotations = turned.copy()
+    rotations[:, 1:] = np.swapaxes(turned[:, body.parents[1:]], -1, -2) @ turned[:, 1:]
+    return rotations
 
 
 def resample(capture: Capture, fps: float) -> Capture:
@@ -214,6 +234,7 @@ def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return Rotation.align_vectors(end[None], start[None])[0].as_matrix()
 
 
-def _leg(places: dict[str, np.ndarray]) -> float:
+def leg_length(places: dict[str, np.ndarray]) -> float:
+    """Length of the left leg, from hip to ankle, of joints by CMU's names."""
     hip, knee, ankle = places["LeftUpLeg"], places["LeftLeg"], places["LeftFoot"]
     return float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))

@@ -1,0 +1,192 @@
+"""Bodies of the SMPL family (SMPL, SMPL-H, SMPL-X), as their authors publish them.
+
+    python -m data_prep.smpl SMPL_FEMALE.pkl body.h5
+    python -m data_prep.smpl SMPLX_NEUTRAL.npz body.h5 --shapes 16
+
+The files are not ours to give: register at smpl.is.tue.mpg.de, and mind their licence. A .pkl is read without chumpy,
+and nothing in it is run: of what pickle can build only arrays, numbers and texts are allowed.
+"""
+
+import codecs
+import copyreg
+import pickle
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+import tyro
+
+from clothjax.storage import save_body
+from clothjax.types import Body
+
+BODY = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+FINGERS = tuple(
+    f"{side}_{finger}{i}" for side in ("left", "right") for finger in ("index", "middle", "pinky", "ring", "thumb")
+    for i in (1, 2, 3)
+)  # fmt: skip
+NAMES = {
+    24: (*BODY, "left_hand", "right_hand"),
+    52: (*BODY, *FINGERS),
+    55: (*BODY, "jaw", "left_eye", "right_eye", *FINGERS),
+}
+KEYS = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table")
+
+
+class _Built:
+    """Stands for an object of a class that is not loaded: only what it consists of."""
+
+    def __setstate__(self, state):
+        self.state = state
+
+
+class _Chumpy(_Built):
+    pass
+
+
+class _Sparse(_Built):
+    pass
+
+
+# what the published files ask for, by the names that it had when they were written and has now
+ALLOWED = {
+    "numpy.ndarray": np.ndarray,
+    "numpy.dtype": np.dtype,
+    "numpy.core.multiarray._reconstruct": np._core.multiarray._reconstruct,
+    "numpy._core.multiarray._reconstruct": np._core.multiarray._reconstruct,
+    "numpy.core.multiarray.scalar": np._core.multiarray.scalar,
+    "numpy._core.multiarray.scalar": np._core.multiarray.scalar,
+    "scipy.sparse.csc.csc_matrix": _Sparse,
+    "scipy.sparse._csc.csc_matrix": _Sparse,
+    "chumpy.ch.Ch": _Chumpy,
+    "_codecs.encode": codecs.encode,
+    "copy_reg._reconstructor": copyreg._reconstructor,
+    "copyreg._reconstructor": copyreg._reconstructor,
+    "__builtin__.object": object,
+    "builtins.object": object,
+}
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str):
+        if f"{module}.{name}" not in ALLOWED:
+            raise ValueError(f"it asks for {module}.{name}, which no body model needs: do not trust it")
+        return ALLOWED[f"{module}.{name}"]
+
+
+def read(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of a model, dense, of those in KEYS and `posedirs`.
+
+    Raises:
+        ValueError: naming the file, if it cannot be read, asks for code, or lacks an array.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                found = {key: file[key] for key in (*KEYS, "posedirs") if key in file.files}
+        else:
+            with path.open("rb") as file:
+                whole = _Unpickler(file, encoding="latin1").load()
+            found = {key: _array(whole[key]) for key in (*KEYS, "posedirs") if key in whole}
+    except FileNotFoundError:
+        raise
+    except (ValueError, pickle.UnpicklingError, zipfile.BadZipFile, *_BROKEN) as error:
+        raise ValueError(f"{path}: not a body model of the SMPL family: {error}") from error
+    missing = [key for key in KEYS if key not in found]
+    if missing:
+        raise ValueError(f"{path}: has no {', '.join(missing)}: is it a body model of the SMPL family?")
+    return found
+
+
+_BROKEN = (EOFError, OSError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, ImportError)
+
+
+def _array(value) -> np.ndarray:
+    if isinstance(value, _Chumpy):
+        value = value.state["x"]
+    if isinstance(value, _Sparse):
+        state = value.state
+        shape = state["_shape"] if "_shape" in state else state["shape"]
+        value = scipy.sparse.csc_matrix((state["data"], state["indices"], state["indptr"]), shape).toarray()
+    return np.asarray(value)
+
+
+def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
+    """The body of a model file, with so many shape parameters, and its joint names.
+
+    Its joints are linear in betas, as the model's regressor has them; pose blend shapes are kept.
+
+    Raises:
+        ValueError: naming the file, the array and what is wrong with it.
+    """
+    found = read(path)
+
+    def floats(key: str, *shape: int | None) -> np.ndarray:
+        try:
+            array = np.asarray(found[key], np.float64)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path}: {key} is not of numbers ({error})") from error
+        if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
+            wanted = " x ".join("any" if n is None else str(n) for n in shape)
+            raise ValueError(f"{path}: {key} has shape {array.shape}, expected {wanted}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{path}: {key} has an entry that is not finite")
+        return array
+
+    vertices = floats("v_template", None, 3)
+    count = len(vertices)
+    weights = floats("weights", count, None)
+    joints = weights.shape[1]
+    if joints not in NAMES:
+        raise ValueError(f"{path}: has {joints} joints; those of {', '.join(map(str, NAMES))} are known")
+    regressor = floats("J_regressor", joints, count)
+    shapedirs = floats("shapedirs", count, 3, None)
+    if not 1 <= shapes <= shapedirs.shape[-1]:
+        raise ValueError(f"{path}: has {shapedirs.shape[-1]} shape parameters; --shapes {shapes} is out of range")
+    shapedirs = shapedirs[..., :shapes]
+    parents = floats("kintree_table", 2, joints)[0].astype(np.int64)
+    parents[0] = -1
+    if (parents[1:] < 0).any() or (parents[1:] >= np.arange(1, joints)).any():
+        raise ValueError(f"{path}: kintree_table: a parent does not come before its child")
+    faces = floats("f", None, 3)
+    if faces.min() < 0 or faces.max() >= count:
+        raise ValueError(f"{path}: f: a face names vertex {int(faces.max())} of {count}")
+    posedirs = floats("posedirs", count, 3, 9 * (joints - 1)).astype(np.float32) if "posedirs" in found else None
+    return Body(
+        vertices=vertices.astype(np.float32),
+        faces=faces.astype(np.int32),
+        joints=(regressor @ vertices).astype(np.float32),
+        parents=parents.astype(np.int32),
+        weights=weights.astype(np.float32),
+        shapedirs=shapedirs.astype(np.float32),
+        joint_shapedirs=np.einsum("jv,vcs->jcs", regressor, shapedirs).astype(np.float32),
+        posedirs=posedirs,
+    ), NAMES[joints]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """A body of the SMPL family as a body file."""
+
+    model: tyro.conf.Positional[Path]
+    """.pkl or .npz as published."""
+    output: tyro.conf.Positional[Path]
+    shapes: int = 10
+    """Shape parameters to keep, the first ones."""
+
+
+def main(args: Arguments) -> None:
+    """Writes the file the arguments ask for."""
+    found, names = body(args.model, args.shapes)
+    save_body(args.output, found, names, name=args.output.stem, source=args.model.name, licence="of the model")
+    print(f"{args.output}: {len(found.vertices)} vertices, {len(names)} joints, {args.shapes} shape parameters")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
