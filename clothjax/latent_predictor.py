@@ -115,6 +115,12 @@ def bounded(row: Array, low: Array, high: Array, slack: Array | float = CODE_SLA
     return inside, jnp.all(jnp.abs(inside - row) <= slack)
 
 
+def widened(scale: Scale, rows: np.ndarray) -> Scale:
+    """The same scale, with rows [n, N] within its range."""
+    rows = np.asarray(normalise(jax.tree.map(np.asarray, scale), rows))
+    return scale._replace(low=np.minimum(scale.low, rows.min(0)), high=np.maximum(scale.high, rows.max(0)))
+
+
 def measure(rows: np.ndarray) -> Scale:
     """The scale of rows [n, N]."""
     rows = np.asarray(rows, np.float64)

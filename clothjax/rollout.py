@@ -1,7 +1,7 @@
 """One simulated frame of Phi, and rollouts: a scan of frames with the losses accumulated inside."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,10 @@ class Taken(NamedTuple):
 
     new: Array  # [V, 3] m, relative to the root at the current frame
     step: TimeStep
-    seen: Features | None  # what Phi saw
+    seen: Any  # of an animator: of Phi, its features
 
 
-Animator = Callable[
-    [ClothState, Pose, Window, TimeStep, Callable[[Array], Array]], tuple[Array, Array, Features | None]
-]
+Animator = Callable[[ClothState, Pose, Window, TimeStep, Callable[[Array], Array]], tuple[Array, Array, Any]]
 """From a state, three poses, the character's three frames, a time step and its potential: the next positions [V, 3] m,
 their code [L], and what was seen."""
 

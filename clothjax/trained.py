@@ -101,9 +101,18 @@ def pack(run: str | Path, out: str | Path) -> int:
         raise ValueError(
             f"{run}: stage 1 was trained further after stage 2: remove its stage2/ and tuning/, and train again"
         )
+    return write(out, config, model, predictor, normalizers)
+
+
+def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalizers: Normalizers) -> int:
+    """Writes a packed model; returns the bytes of its weights.
+
+    Args:
+        phi: `params` and `statistics`.
+    """
     parts = {
-        "phi": model["params"],
-        "statistics": {name: each._asdict() for name, each in model["statistics"].items()},
+        "phi": phi["params"],
+        "statistics": {name: each._asdict() for name, each in phi["statistics"].items()},
         "predictor": predictor,
         "normalizers": {name: each._asdict() for name, each in normalizers._asdict().items()},
     }

@@ -14,6 +14,7 @@ Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere
 
 import argparse
 import dataclasses
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -36,7 +37,9 @@ from clothjax import (
     trained,
     tuning,
 )
+from clothjax.clips import Clips
 from clothjax.config import Config, EvaluationConfig
+from clothjax.latent_predictor import Normalizers
 from experiments.session import fail_clearly, progress, setup
 
 STEPS_PER_CALL = 20
@@ -136,25 +139,50 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         return clock
 
     devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    psi = tuning.psi(
-        second.state.garment,
-        second.state.normalizers,
-        joints,
-        model["params"].get("inverse_hessian"),
-        config.tuning.preconditioning,
+    tuned = tune(
+        whole, reel, model["params"], garment, second.state.average, second.state.normalizers, directory, device_mesh
     )
-    third = fit.fit(
-        stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
-        devices.replicate(tuning.init(second.state.average, whole.scene, reel, config), device_mesh),
+    clock["compile_seconds"] += tuned.compile_seconds
+    return clock | {"tuning_seconds": tuned.seconds}
+
+
+def tune(
+    whole: experiment.Experiment,
+    reel: Clips,
+    phi: dict,
+    garment: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    directory: Path,
+    device_mesh: Mesh | None = None,
+) -> fit.Fitted:
+    """Psi tuned on the physics, with the preconditioner of its Phi.
+
+    Args:
+        phi: parameters; garment: its decoder and blend shapes.
+        directory: of the run.
+    """
+    config = whole.config
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    inverse = phi.get("inverse_hessian")
+    if inverse is None:
+        inverse = stage1.rest_inverse_hessian(garment, whole.scene, config)
+    frozen = jax.device_get(tuning.Frozen(garment, normalizers, inverse))
+    folder = directory / "tuning"
+    update = tuning.make_update(whole.scene, reel, kept, frozen, config, folder, STEPS_PER_CALL, device_mesh)
+    fitted = fit.fit(
+        update,
+        devices.replicate(tuning.init(predictor, config), device_mesh),
         steps=config.tuning.steps,
         steps_per_call=STEPS_PER_CALL,
-        directory=directory / "tuning",
-        config=kept,
+        directory=folder,
+        config=configuration.to_dict(config),
         description=f"tuning, {config.garment}",
         may_differ=("directory", "evaluation"),
     )
-    clock["compile_seconds"] += third.compile_seconds
-    return clock | {"tuning_seconds": third.seconds}
+    if jax.process_index() == 0:
+        shutil.rmtree(folder / tuning.ROUNDS, ignore_errors=True)  # they are large, and of no more use
+    return fitted
 
 
 def _spent(directory: Path, **seconds: float) -> dict[str, float]:

@@ -97,7 +97,7 @@ def config(tmp_path_factory):
         config,
         stage1=dataclasses.replace(config.stage1, steps=20, pool=8, batch=4, restart_probability=0.5),
         stage2=dataclasses.replace(config.stage2, steps=20, batch=4, sequences=3),
-        tuning=TuningConfig(steps=20, batch=4, pool=8),
+        tuning=TuningConfig(steps=20, rounds=1, sequences=2, frames=4, batch=4),
     )
     path = tmp_path_factory.mktemp("several") / "small.yaml"
     path.write_text(yaml.safe_dump(json.loads(json.dumps(configuration.to_dict(config)))))

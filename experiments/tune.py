@@ -1,0 +1,45 @@
+"""Tunes Psi of a garment that comes with the library, or of a packed one, further: on motions or bodies of yours.
+
+    python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 4000
+
+Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
+garment, for `clothjax.load` and all programs that take a run, and `tuning/`; run it again to go on where it stopped.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import jax
+
+from clothjax import configuration, experiment, latent_predictor, stage2, trained
+from clothjax.config import Config
+from experiments.session import fail_clearly, setup
+from experiments.train import tune
+
+
+def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0], allow_abbrev=False)
+    parser.add_argument("garment", help="one that comes with the library, or the folder of a packed one")
+    parser.add_argument("--out", type=Path, required=True, help="folder to leave it in")
+    given, settings = parser.parse_known_args(argv)
+    folder = Path(given.garment) if trained.packed(given.garment) else trained.folder(given.garment)
+    config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(given.out)])
+    if config.tuning.steps < 1:
+        raise ValueError("tuning.steps is 0: give --tuning.steps")
+    _, phi = trained.phi(folder)
+    _, garment, predictor, normalizers = trained.psi(folder)
+    whole = experiment.assemble(config)
+    reel, _ = experiment.training_clips(whole)
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    seen = stage2.ordinary_poses(whole.scene, reel, kept, config)
+    normalizers = normalizers._replace(pose=latent_predictor.widened(normalizers.pose, seen))
+    tuned = tune(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
+    size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
+    print(f"{given.out}: {size / 1e6:.2f} MB of weights")
+
+
+if __name__ == "__main__":
+    setup()
+    with fail_clearly():
+        main(sys.argv[1:])
