@@ -242,8 +242,32 @@ class Stage1Config:
 
 
 @dataclass(frozen=True)
-class TuningConfig:
-    """Training of Psi after its regression, on the physics of its own closed loops (`clothjax/tuning.py`). Bodies and
+class TuningConfig(Stage1Config):
+    """Training of Psi on the physics after its regression: as stage 1, with Psi in the place of Phi. The bodies are
+    those of `stage1.betas`; `betas` here is not read."""
+
+    steps: int = 0
+    pool: int = 192
+    learning_rate: float = 1.5e-4
+    clip: float = 20.0
+    """Three times an ordinary gradient of a skirt, whose gradients of contact then count for more without drowning the
+    others; those of a dress are larger, and nearly all of them clipped."""
+    start_timestep: float = 0.0
+    preconditioning: float = 0.5
+    """Power of Phi's inverse Hessian, where `model.latent_update` is `descent`, that gradients of codes are multiplied
+    by; 0: none. The cloth is up to 4 000 times stiffer along some codes, in standard deviations, than along others.
+    With 1, errors of all would count alike, which energies do not."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        _require(self.blendshape_rate == 0, "tuning does not train the blend shapes: set stage1.blendshape_rate")
+        _require(self.start_timestep == 0, "Psi does not know the time step: tuning.start_timestep must be 0")
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Training of Psi on what the physics says it should have predicted in its own closed loops
+    (`clothjax/refinement.py`). Bodies and
     materials are those of stage 1."""
 
     steps: int = 0
@@ -255,6 +279,8 @@ class TuningConfig:
     """... this many frames of each."""
     descent_steps: int = 6
     """Conjugate-gradient steps from a code that Psi predicted to the one it should have."""
+    noise: float = 0.1
+    """Standard deviation of the noise on codes that are read, in theirs, so that Psi learns to come back."""
     vertex_stiffness: float = 650.0
     """J/m^2. So much more than its energy an error of a code costs for the mean squared displacement of vertices: soft
     ways to move, where energy hardly tells right from wrong, are else learnt badly, and lead astray."""
@@ -267,7 +293,7 @@ class TuningConfig:
 
     def __post_init__(self):
         for name in ("rounds", "sequences", "frames", "descent_steps"):
-            _require(getattr(self, name) >= 1, f"tuning.{name} must be >= 1, got {getattr(self, name)}")
+            _require(getattr(self, name) >= 1, f"refinement.{name} must be >= 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -337,6 +363,7 @@ class Config:
     stage1: Stage1Config = field(default_factory=Stage1Config)
     stage2: Stage2Config = field(default_factory=Stage2Config)
     tuning: TuningConfig = field(default_factory=TuningConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     directory: str = ""
     """Where the run is kept; empty: runs/<name of the config file>."""

@@ -64,7 +64,8 @@ def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
     bad = [plausibility.bad_frames(clip, experiment.body) for clip in motions]
     # the kind of motion, as in walk_0 or cmu_01_02: kinds are drawn equally often
     families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
-    shortest = max(experiment.config.stage1.rollout, experiment.config.stage1.rollout_end) + 1
+    stages = [experiment.config.stage1] + [experiment.config.tuning] * (experiment.config.tuning.steps > 0)
+    shortest = max(max(stage.rollout, stage.rollout_end) for stage in stages) + 1
     reel = clips.concatenate(motions, families, bad, shortest)
     return reel, {name: len(wrong) for name, wrong in zip(names, bad)}
 

@@ -1,7 +1,7 @@
 """One simulated frame of Phi, and rollouts: a scan of frames with the losses accumulated inside."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +24,12 @@ class Taken(NamedTuple):
 
     new: Array  # [V, 3] m, relative to the root at the current frame
     step: TimeStep
-    seen: Any  # of an animator: of Phi, its features
+    seen: Features | None  # what Phi saw
 
 
-Animator = Callable[[ClothState, Pose, Window, TimeStep, Callable[[Array], Array]], tuple[Array, Array, Any]]
+Animator = Callable[
+    [ClothState, Pose, Window, TimeStep, Callable[[Array], Array]], tuple[Array, Array, Features | None]
+]
 """From a state, three poses, the character's three frames, a time step and its potential: the next positions [V, 3] m,
 their code [L], and what was seen."""
 

@@ -20,8 +20,11 @@ from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.fit import Weights
 from clothjax.losses import TimeStep
+from clothjax.rollout import Animator
 from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Material
+
+MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
 
 
 class Simulation(NamedTuple):
@@ -125,6 +128,13 @@ def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None
     if config.model.latent_update == "descent":
         params["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(params["garment"])
     statistics = compact_latent.init_statistics(example)
+    return starting(params, statistics, key, pool_key, scene, clips, config)
+
+
+def starting(
+    params: dict, statistics: dict, key: Array, pool_key: Array, scene: Scene, clips: Clips, config: Config
+) -> TrainingState:
+    """The state before the first step of training such parameters."""
     pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(jax.random.split(pool_key, config.stage1.pool))
     return TrainingState(
         step=jnp.int32(0),
@@ -193,6 +203,7 @@ def make_curriculum(
     config: Config,
     steps: int,
     device_mesh: Mesh | None = None,
+    animator: MakeAnimator = rollout.phi,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """`make_update` with the rollout growing as training proceeds; one compilation for each length."""
     made = {}
@@ -200,7 +211,7 @@ def make_curriculum(
     def update(state: TrainingState):
         frames = rollout_length(int(state.step), config)
         if frames not in made:
-            made[frames] = make_update(scene, clips, config, frames, steps, device_mesh)
+            made[frames] = make_update(scene, clips, config, frames, steps, device_mesh, animator)
         return made[frames](state)
 
     return update
@@ -213,10 +224,14 @@ def make_update(
     frames: int,
     steps: int,
     device_mesh: Mesh | None = None,
+    animator: MakeAnimator = rollout.phi,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """A jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
 
     It consumes its argument (buffers are donated). The simulations of a batch are spread over the devices.
+
+    Args:
+        animator: what is trained, made of its `params` and `statistics`.
     """
     stage = config.stage1
     transform = optimizer(config)
@@ -224,7 +239,7 @@ def make_update(
     def part(simulations, params, statistics, step, clips):
         def loss(params, simulation):
             character = wearer(scene, simulation.betas, simulation.material, config)
-            animate = rollout.phi({"params": params, "statistics": statistics}, scene, character, config)
+            animate = animator({"params": params, "statistics": statistics}, scene, character, config)
             return rollout.training_rollout(
                 animate, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
                 step, frames, config,
@@ -263,13 +278,15 @@ def make_update(
         cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
         following = Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
 
-        statistics = jax.lax.cond(
-            metrics["nonfinite"] | (state.step >= config.model.normalizer_steps),
-            lambda statistics, _: statistics,
-            compact_latent.observe,
-            state.statistics,
-            seen,
-        )
+        statistics = state.statistics
+        if seen is not None:
+            statistics = jax.lax.cond(
+                metrics["nonfinite"] | (state.step >= config.model.normalizer_steps),
+                lambda statistics, _: statistics,
+                compact_latent.observe,
+                statistics,
+                seen,
+            )
         new = TrainingState(
             step=state.step + 1,
             key=state.key,

@@ -19,7 +19,7 @@ from clothjax.latent_predictor import Normalizers, Scale
 
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG = "model.npz", "config.yaml"
-STAGES = ("stage1", "stage2", "tuning")
+STAGES = ("stage1", "stage2", "tuning", "refinement")
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 LARGE = 2000  # entries of a matrix that is worth eight bits
@@ -58,7 +58,7 @@ def phi(run: str | Path) -> tuple[Config, dict]:
 
 
 def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
-    """The configuration, the decoder with its blend shapes, the predictor (the tuned one where there is one) and its
+    """The configuration, the decoder with its blend shapes, the predictor (after all that trained it) and its
     normalizers, of a run or a packed model.
 
     Raises:
@@ -68,12 +68,13 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
         config, parts = _unpack(Path(run))
         garment, predictor = parts["phi"]["garment"], parts["predictor"]
     else:
-        directory, tuned = (Path(run) / stage / "checkpoints" for stage in ("stage2", "tuning"))
+        directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
         parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
         config = _config(Path(run))
         garment, predictor = parts["garment"], parts["average"]
-        if checkpoint.steps(tuned):
-            predictor = checkpoint.read(tuned, "average")[0]["average"]
+        for trained_on in later:
+            if checkpoint.steps(trained_on):
+                predictor = checkpoint.read(trained_on, "average")[0]["average"]
     normalizers = Normalizers(*(Scale(**parts["normalizers"][name]) for name in Normalizers._fields))
     return config, garment, predictor, normalizers
 
@@ -99,7 +100,7 @@ def pack(run: str | Path, out: str | Path) -> int:
     decoder = checkpoint.named(model["params"]["garment"])
     if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(garment).items()):
         raise ValueError(
-            f"{run}: stage 1 was trained further after stage 2: remove its stage2/ and tuning/, and train again"
+            f"{run}: stage 1 was trained further after stage 2: remove its {', '.join(STAGES[1:])}, and train again"
         )
     return write(out, config, model, predictor, normalizers)
 

@@ -1,311 +1,95 @@
-"""Psi after its regression, trained on in its own closed loop (DAgger, Ross et al. 2011), by the physics.
+"""Psi after its regression, trained on by the physics of its own closed loop."""
 
-In rounds: Psi plays random clips on random bodies in random cloth, and in every frame some conjugate-gradient steps
-down the potential, from the code that it predicts, find a better one. Psi learns to predict that, on the frames of all
-rounds so far, as far as the codes differ in energy. So what it sees is what it will see in use, and what it learns
-comes from the physics alone.
-"""
-
-import math
-import sys
-import zipfile
+import dataclasses
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.sharding import Mesh
-from tqdm import tqdm
 
-from clothjax import clips as motion
-from clothjax import compact_latent, devices, fit, garment_model, latent_predictor, rollout, sampling, stage1
+from clothjax import compact_latent, latent_predictor, stage1
 from clothjax.character import Character, Window
 from clothjax.clips import Clips
-from clothjax.config import Config, TuningConfig
-from clothjax.fit import Weights
+from clothjax.config import Config, Ramp, Stage1Config
 from clothjax.latent_predictor import Normalizers
+from clothjax.losses import TimeStep
 from clothjax.rollout import Animator
 from clothjax.scene import Scene
+from clothjax.stage1 import MakeAnimator
 from clothjax.types import Array, ClothState, Pose
 
-LOST = 30.0  # times the median gain: cloth that has gone into the body, from where few steps do not find the way
-ROBUST = 40.0  # times the median of a batch: the error from which on it counts by its root
-PLAYED = 0.4  # of the steps, over which the rounds are spread
-ROUNDS = "rounds"  # the folder of their files
-UNREADABLE = (ValueError, LookupError, OSError, EOFError, zipfile.BadZipFile)
+
+def settings(config: Config) -> Config:
+    """The configuration with that of the tuning in the place of stage 1's: for its bodies, at its last loss weights."""
+    names = [field.name for field in dataclasses.fields(Stage1Config)]
+    stage = Stage1Config(**{name: getattr(config.tuning, name) for name in names} | {"betas": config.stage1.betas})
+    ramps = {field.name: getattr(config.loss, field.name) for field in dataclasses.fields(config.loss)}
+    last = {
+        name: Ramp(ramp.start if ramp.end is None else ramp.end)
+        for name, ramp in ramps.items()
+        if isinstance(ramp, Ramp)
+    }
+    return dataclasses.replace(config, stage1=stage, loss=dataclasses.replace(config.loss, **last))
 
 
-class Frozen(NamedTuple):
-    """What tuning does not change."""
-
-    garment: dict  # decoder and blend shapes
-    normalizers: Normalizers
-    inverse: Array  # [L, L] in 1/J, an approximate inverse Hessian of codes, as Phi's descent has it
-
-
-class Frames(NamedTuple):
-    """Frames of Psi's closed loops, and what it should have predicted there, in standard deviations."""
-
-    codes: Array  # [N, L] before the frame
-    poses: Array  # [N, P] inputs
-    constants: Array  # [N, C]
-    better: Array  # [N, L] codes of the frame
-    gain: Array  # [N] J, by how much they are better than those predicted
-
-
-class TrainingState(NamedTuple):
-    """All that tuning is at a step, but for the frames, which are in files."""
-
-    step: Array  # int32
-    key: Array
-    params: dict
-    average: dict
-    optimizer: optax.OptState
-
-
-def init(predictor: dict, config: Config) -> TrainingState:
+def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.TrainingState:
     """The state before the first step."""
-    params = jax.tree.map(jnp.array, predictor)
-    return TrainingState(
-        step=jnp.int32(0),
-        key=jax.random.key(config.tuning.seed),
-        params=params,
-        average=jax.tree.map(jnp.array, params),
-        optimizer=optimizer(config).init(params),
-    )
+    key, pool_key = jax.random.split(jax.random.key(config.tuning.seed))
+    clips = jax.tree.map(jnp.asarray, clips)
+    return stage1.starting(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
 
 
-def optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam behind a clipped norm, at a rate that is constant while Psi is played, then cosine-decayed."""
-    tuning = config.tuning
-    played = int(PLAYED * tuning.steps)
-    decay = optax.cosine_decay_schedule(tuning.learning_rate, max(1, tuning.steps - played), alpha=0.01)
-    rate = optax.join_schedules([optax.constant_schedule(tuning.learning_rate), decay], [played])
-    return optax.chain(optax.clip_by_global_norm(tuning.clip), optax.adam(rate, b2=0.99))
+@jax.custom_vjp
+def precondition(matrix: Array, code: Array) -> Array:
+    """The same code [L], whose gradient is multiplied by a symmetric matrix [L, L]."""
+    return code
 
 
-def psi(predictor: dict, frozen: Frozen, scene: Scene, character: Character, kept: np.ndarray, config: Config):
-    """Psi as what moves a character's garment (an `Animator`), which tells its inputs too: (code, pose, constants).
+precondition.defvjp(lambda matrix, code: (code, matrix), lambda matrix, g: (jnp.zeros_like(matrix), matrix @ g))
+
+
+def preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: float) -> Array:
+    """The matrix [L, L] for gradients of normalised codes: an inverse Hessian to a power, without its scale.
 
     Args:
-        kept: joints that are inputs.
+        inverse: [L, L] in 1/J, of codes as they are.
     """
-    normalizers = frozen.normalizers
-    constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
-
-    def animate(state: ClothState, poses: Pose, window: Window, _step, _potential: Callable):
-        inputs = latent_predictor.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
-        inputs = latent_predictor.normalise(normalizers.pose, inputs)
-        latent = latent_predictor.normalise(normalizers.latent, state.latent)
-        next_latent = latent_predictor.predict(predictor, latent, inputs, constants, config.stage2.latent_decay)
-        next_latent, _ = latent_predictor.bounded(next_latent, normalizers.latent.low, normalizers.latent.high)
-        code = latent_predictor.denormalise(normalizers.latent, next_latent)
-        new = compact_latent.decode({"garment": frozen.garment}, scene, character, code, window, config.model)
-        return new, code, (latent, inputs, constants)
-
-    return animate
+    deviation = np.asarray(normalizers.latent.deviation, np.float64)
+    values, vectors = np.linalg.eigh(np.asarray(inverse, np.float64) / np.outer(deviation, deviation))
+    values = np.maximum(values, 1e-12 * values[-1]) ** power
+    return jnp.asarray((vectors * values / np.sqrt(np.mean(values**2))) @ vectors.T, jnp.float32)
 
 
-def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
-    """A function of a key, the predictor, `Frozen` and clips: the frames [T] of one closed loop of Psi, corrected."""
-    tuning = config.tuning
+def psi(
+    garment: dict, normalizers: Normalizers, kept: np.ndarray, inverse: np.ndarray | None = None, power: float = 0.0
+) -> MakeAnimator:
+    """Psi, of `params`, as what moves a character's garment: with a frozen decoder, on the joints `kept`.
 
-    def corrected(animate: Animator, frozen: Frozen, character: Character) -> Animator:
-        def correct(state: ClothState, poses: Pose, window: Window, step, potential: Callable):
-            new, code, inputs = animate(state, poses, window, step, potential)
+    Args:
+        inverse: the inverse Hessian [L, L] of Phi's descent, whose `power` preconditions the gradients of codes.
+    """
+    matrix = None if inverse is None or power == 0 else preconditioner(inverse, normalizers, power)
 
-            def garment(code):
-                return compact_latent.decode({"garment": frozen.garment}, scene, character, code, window, config.model)
+    def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
+        constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
 
-            better = compact_latent.descend(
-                lambda g: frozen.inverse @ g, code, garment, potential, tuning.descent_steps, config.model.descent_bound
+        def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, _potential: Callable):
+            inputs = latent_predictor.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
+            latent = latent_predictor.predict(
+                model["params"],
+                latent_predictor.normalise(normalizers.latent, state.latent),
+                latent_predictor.normalise(normalizers.pose, inputs),
+                constants,
+                config.stage2.latent_decay,
             )
-            gain = potential(new) - potential(garment(better))
-            return new, code, Frames(*inputs, latent_predictor.normalise(frozen.normalizers.latent, better), gain)
+            # in range as in use, where there is no gradient to lose
+            inside, _ = latent_predictor.bounded(latent, normalizers.latent.low, normalizers.latent.high)
+            latent = latent + jax.lax.stop_gradient(inside - latent)
+            shown = latent if matrix is None else precondition(matrix, latent)
+            code, shown = (latent_predictor.denormalise(normalizers.latent, z) for z in (latent, shown))
+            new = compact_latent.decode({"garment": garment}, scene, character, shown, window, config.model)
+            return new, code, None
 
-        return correct
+        return animate
 
-    def sequence(key: Array, predictor: dict, frozen: Frozen, clips: Clips) -> Frames:
-        simulation = stage1.begin(key, scene, clips, config)
-        character = stage1.wearer(scene, simulation.betas, simulation.material, config)
-        animate = corrected(psi(predictor, frozen, scene, character, kept, config), frozen, character)
-
-        def frame(state, poses):
-            taken, (_, _, seen) = rollout.take(animate, scene, character, state, poses, 1.0 / config.fps, config)
-            return rollout.follow(taken, poses.translation[2]), seen
-
-        poses = motion.there_and_back(clips, simulation.frame, tuning.frames)
-        return jax.lax.scan(frame, simulation.cloth, poses)[1]
-
-    return sequence
-
-
-def worth(frames: Frames) -> Frames:
-    """Those of frames [N, T] from which there is something to learn, as [n]."""
-    frames = Frames(*(np.asarray(x).reshape(-1, *x.shape[2:]) for x in frames))
-    finite = np.isfinite(frames.gain) & np.isfinite(frames.better).all(axis=1)
-    most = LOST * np.median(frames.gain[finite]) if finite.any() else 0.0
-    chosen = Frames(*(x[finite & (np.abs(frames.gain) < most)] for x in frames))
-    return chosen._replace(poses=chosen.poses.astype(np.float16))  # half of what there is to keep
-
-
-def metric(frozen: Frozen, config: Config) -> Array:
-    """The matrix M [L, L] in J such that an error e of a code, in standard deviations, costs e^T M e / 2.
-
-    It is the Hessian of the energy, and `tuning.vertex_stiffness` for the mean squared displacement of vertices.
-    """
-    latent = frozen.normalizers.latent
-    deviation = np.asarray(latent.deviation, np.float64)
-    hessian = np.linalg.inv(np.asarray(frozen.inverse, np.float64)) * np.outer(deviation, deviation)
-    weights = jax.jacobian(
-        lambda code: garment_model.blend_weights(
-            frozen.garment, latent_predictor.denormalise(latent, code), config.model
-        )
-    )(jnp.zeros(len(deviation)))
-    shapes = np.asarray(frozen.garment["blendshapes"], np.float64)
-    moved = np.asarray(weights, np.float64).T @ shapes.reshape(len(shapes), -1)
-    squared = moved @ moved.T / shapes.shape[1]
-    return jnp.asarray(hessian + 2.0 * config.tuning.vertex_stiffness * squared, jnp.float32)
-
-
-def make_update(
-    scene: Scene,
-    clips: Clips,
-    kept: np.ndarray,
-    frozen: Frozen,
-    config: Config,
-    directory: Path,
-    steps: int,
-    device_mesh: Mesh | None = None,
-) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """A function that takes `steps` training steps, and their metrics [steps]; it consumes its argument.
-
-    Where a round begins, it first plays Psi, or reads what an interrupted training has played. A batch, and what is
-    played, is spread over the devices.
-
-    Args:
-        directory: of the rounds' files.
-    """
-    tuning = config.tuning
-    transform, cost = optimizer(config), metric(frozen, config)
-    play = sampling.sampler(make_rollout(scene, kept, config), tuning.sequences, device_mesh)
-    frozen, clips = (devices.replicate(x, device_mesh) for x in (frozen, clips))
-    begun = {number for number in range(tuning.rounds) if _path(directory, number).exists()}
-    turns, held = schedule(tuning, steps), []
-    size = tuning.rounds * tuning.sequences * tuning.frames
-
-    def played(number: int, average: dict) -> Frames:
-        found = worth(play(tuning.seed + 1 + number, (average, frozen, clips)))
-        if not len(found.gain):
-            raise ValueError("no closed loop of Psi stayed finite: train stage 2 further before tuning it")
-        if jax.process_index() == 0:
-            _write(_path(directory, number), found)
-            gain = 1e3 * np.median(found.gain)
-            tqdm.write(
-                f"round {number + 1} of {tuning.rounds}: of half its frames Psi is within {gain:.1f} mJ", sys.stdout
-            )
-        return found
-
-    def data(number: int, average: dict) -> tuple[Frames, Array]:
-        """The frames of all rounds so far, in arrays of one size, and how many there are."""
-        for each in range(len(held), number + 1):
-            if each < number and each not in begun:
-                raise ValueError(f"{_path(directory, each)} is gone, and cannot be played again: remove {directory}")
-            held.append(_read(_path(directory, each)) if each in begun else played(each, average))
-        whole = Frames(*(np.concatenate(parts) for parts in zip(*held, strict=True)))
-        count = len(whole.gain)
-        padded = Frames(*(np.pad(x, [(0, size - count)] + [(0, 0)] * (x.ndim - 1)) for x in whole))
-        return devices.replicate(padded, device_mesh), jnp.int32(count)
-
-    def error(rows: Array, params: dict, frames: Frames, cost: Array):
-        return excess(params, Frames(*(x[rows] for x in frames)), cost, config)
-
-    each = devices.shard(error, device_mesh)
-
-    def one(frames: Frames, count: Array, state: TrainingState, _):
-        rows = jax.random.randint(jax.random.fold_in(state.key, state.step), (tuning.batch,), 0, count)
-
-        def loss(params):
-            found = each(rows, params, frames, cost)
-            return robust(found), found
-
-        (value, found), gradient = jax.value_and_grad(loss, has_aux=True)(state.params)
-        weights, metrics = fit.descend(
-            transform, Weights(state.params, state.average, state.optimizer), value, gradient, tuning.ema
-        )
-        metrics["excess"] = jnp.median(found)
-        return state._replace(step=state.step + 1, **weights._asdict()), metrics
-
-    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
-    def train(state, frames, count):
-        return jax.lax.scan(partial(one, frames, count), state, None, length=steps)
-
-    now = None
-
-    def update(state: TrainingState):
-        nonlocal now
-        number = turns[int(state.step) // steps]
-        if now is None or now[0] != number:
-            now = (number, *data(number, state.average))
-        return train(state, *now[1:])
-
-    return update
-
-
-def schedule(tuning: TuningConfig, steps: int) -> list[int]:
-    """The round of every call of so many steps.
-
-    There are steps in proportion to the frames of the rounds so far: more of few frames would be learnt by heart.
-    """
-    turns: list[int] = []
-    for step in range(0, tuning.steps, steps):
-        number = min(int(tuning.rounds * math.sqrt(step / (PLAYED * tuning.steps))), tuning.rounds - 1)
-        turns.append(min(number, turns[-1] + 1) if turns else 0)
-    return turns
-
-
-def excess(params: dict, frames: Frames, cost: Array, config: Config) -> Array:
-    """What the errors of predictions for frames [B] cost, [B] in J.
-
-    Args:
-        cost: of `metric`.
-    """
-    decay = config.stage2.latent_decay
-    predicted = jax.vmap(lambda *row: latent_predictor.predict(params, *row, decay))(
-        frames.codes, frames.poses.astype(jnp.float32), frames.constants
-    )
-    apart = predicted - frames.better
-    return 0.5 * jnp.sum(apart * jnp.matmul(apart, cost), axis=-1)
-
-
-def robust(energies: Array) -> Array:
-    """The mean of energies [B] of errors in units of their median; of large ones their roots count.
-
-    The errors of some frames are a thousand times those of others, and would be all that is learnt of.
-    """
-    unit = ROBUST * jnp.maximum(jax.lax.stop_gradient(jnp.median(energies)), 1e-12)
-    return jnp.mean(2.0 * ROBUST * (jnp.sqrt(1.0 + energies / unit) - 1.0))
-
-
-def _path(directory: Path, number: int) -> Path:
-    return directory / ROUNDS / f"{number:03d}.npz"
-
-
-def _write(path: Path, frames: Frames) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        np.savez(file, **frames._asdict())
-    partial.replace(path)
-
-
-def _read(path: Path) -> Frames:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return Frames(*(file[name] for name in Frames._fields))
-    except UNREADABLE as error:
-        raise ValueError(f"{path} is damaged ({error}): remove {path.parents[1]}, and tune again") from error
+    return make

@@ -1,7 +1,7 @@
 """Packs a finished run as a garment that comes with the library, with what was measured of it.
 
     python -m experiments.ship runs/skirt skirt
-    python -m experiments.ship runs/tuned skirt      # what experiments.tune has made of it
+    python -m experiments.ship runs/refined skirt      # what experiments.refine has made of it
 
 It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
 the validation motions, with the command that trained it and its hours.
@@ -30,11 +30,11 @@ def main(argv: list[str]) -> None:
     hours = 0.0
     if trained.packed(arguments.run):
         before = json.loads((folder / "report.json").read_text())
-        command = f"{before['command']}; python -m experiments.tune {arguments.name} --out {arguments.run}"
+        command = f"{before['command']}; python -m experiments.refine {arguments.name} --out {arguments.run}"
         hours = before["hours"]
         for name in (trained.WEIGHTS, trained.CONFIG):
             shutil.copyfile(arguments.run / name, folder / name)
-        seconds = sum(read_seconds(arguments.run / "tuning"))
+        seconds = sum(read_seconds(arguments.run / "refinement"))
     else:
         size = trained.pack(arguments.run, folder)
         print(f"{folder}: {size / 1e6:.2f} MB of weights")

@@ -4,8 +4,8 @@
     python -m experiments.train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
     python -m experiments.train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
 
-It leaves `stage1/`, `stage2/` and, where `tuning.steps` is not 0, `tuning/` in the run's folder, each with
-checkpoints, metrics.jsonl and training.json.
+It leaves `stage1/`, `stage2/` and, where their steps are not 0, `tuning/` and `refinement/` in the run's folder, each
+with checkpoints, metrics.jsonl and training.json.
 
 With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
 Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere each is told
@@ -31,6 +31,7 @@ from clothjax import (
     latent_predictor,
     preconditioner,
     principal_shapes,
+    refinement,
     run_folder,
     stage1,
     stage2,
@@ -55,7 +56,8 @@ def main(argv: list[str]) -> None:
     directory = run_directory(config, argv)
     with devices.together(directory):
         wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
-        batches = [config.stage1.batch, config.stage2.batch] + [config.tuning.batch] * (config.tuning.steps > 0)
+        batches = [config.stage1.batch, config.stage2.batch]
+        batches += [stage.batch for stage in (config.tuning, config.refinement) if stage.steps > 0]
         train(config, directory, devices.choose(wanted, *batches))
 
 
@@ -65,7 +67,8 @@ def run_directory(config: Config, argv: list[str]) -> Path:
 
 
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
-    """Both stages and the tuning; returns the seconds each took, `compile_seconds` and `teacher_seconds` apart."""
+    """Both stages, the tuning and the refinement; returns the seconds each took, those of compilation, the
+    teacher and the start apart."""
     if device_mesh is not None:
         devices.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     whole = experiment.assemble(config)
@@ -127,7 +130,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         directory=directory / "stage2",
         config=kept,
         description=f"stage 2, {config.garment}",
-        may_differ=("directory", "evaluation", "tuning"),
+        may_differ=("directory", "evaluation", "tuning", "refinement"),
     )
     clock = {
         **_spent(directory, teacher_seconds=seconds),
@@ -135,18 +138,53 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         "stage2_seconds": second.seconds,
         "compile_seconds": first.compile_seconds + second.compile_seconds,
     }
-    if config.tuning.steps == 0:
-        return clock
+    predictor = second.state.average
+    if config.tuning.steps > 0:
+        third = _tune(whole, reel, model["params"], second.state, directory, device_mesh)
+        predictor = third.state.average
+        clock["compile_seconds"] += third.compile_seconds
+        clock["tuning_seconds"] = third.seconds
+    if config.refinement.steps > 0:
+        if config.tuning.steps == 0 and checkpoint.steps(directory / "tuning" / "checkpoints"):
+            raise ValueError(f"{directory / 'tuning'} is of other settings: remove it")
+        normalizers = second.state.normalizers
+        fourth = refine(whole, reel, model["params"], garment, predictor, normalizers, directory, device_mesh)
+        clock["compile_seconds"] += fourth.compile_seconds
+        clock["refinement_seconds"] = fourth.seconds
+    return clock
 
+
+def _tune(
+    whole: experiment.Experiment,
+    reel: Clips,
+    phi: dict,
+    predictor: stage2.TrainingState,
+    directory: Path,
+    device_mesh: Mesh | None,
+) -> fit.Fitted:
+    """Psi after its regression, tuned on the gradients of the energies."""
+    config = whole.config
     devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    tuned = tune(
-        whole, reel, model["params"], garment, second.state.average, second.state.normalizers, directory, device_mesh
+    psi = tuning.psi(
+        predictor.garment,
+        predictor.normalizers,
+        latent_predictor.kept_joints(whole.names, config.stage2),
+        phi.get("inverse_hessian"),
+        config.tuning.preconditioning,
     )
-    clock["compile_seconds"] += tuned.compile_seconds
-    return clock | {"tuning_seconds": tuned.seconds}
+    return fit.fit(
+        stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
+        devices.replicate(tuning.init(predictor.average, whole.scene, reel, config), device_mesh),
+        steps=config.tuning.steps,
+        steps_per_call=STEPS_PER_CALL,
+        directory=directory / "tuning",
+        config=configuration.to_dict(config),
+        description=f"tuning, {config.garment}",
+        may_differ=("directory", "evaluation", "refinement"),
+    )
 
 
-def tune(
+def refine(
     whole: experiment.Experiment,
     reel: Clips,
     phi: dict,
@@ -156,7 +194,7 @@ def tune(
     directory: Path,
     device_mesh: Mesh | None = None,
 ) -> fit.Fitted:
-    """Psi tuned on the physics, with the preconditioner of its Phi.
+    """Psi refined, with the preconditioner of its Phi.
 
     Args:
         phi: parameters; garment: its decoder and blend shapes.
@@ -167,21 +205,21 @@ def tune(
     inverse = phi.get("inverse_hessian")
     if inverse is None:
         inverse = stage1.rest_inverse_hessian(garment, whole.scene, config)
-    frozen = jax.device_get(tuning.Frozen(garment, normalizers, inverse))
-    folder = directory / "tuning"
-    update = tuning.make_update(whole.scene, reel, kept, frozen, config, folder, STEPS_PER_CALL, device_mesh)
+    frozen = jax.device_get(refinement.Frozen(garment, normalizers, inverse))
+    folder = directory / "refinement"
+    update = refinement.make_update(whole.scene, reel, kept, frozen, config, folder, STEPS_PER_CALL, device_mesh)
     fitted = fit.fit(
         update,
-        devices.replicate(tuning.init(predictor, config), device_mesh),
-        steps=config.tuning.steps,
+        devices.replicate(refinement.init(predictor, config), device_mesh),
+        steps=config.refinement.steps,
         steps_per_call=STEPS_PER_CALL,
         directory=folder,
         config=configuration.to_dict(config),
-        description=f"tuning, {config.garment}",
+        description=f"refinement, {config.garment}",
         may_differ=("directory", "evaluation"),
     )
     if jax.process_index() == 0:
-        shutil.rmtree(folder / tuning.ROUNDS, ignore_errors=True)  # they are large, and of no more use
+        shutil.rmtree(folder / refinement.ROUNDS, ignore_errors=True)  # they are large, and of no more use
     return fitted
 
 
@@ -194,7 +232,7 @@ def _spent(directory: Path, **seconds: float) -> dict[str, float]:
 
 
 # stage 1 does not read these, so a run may change them and go on
-DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning")
+DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning", "refinement")
 
 
 def load_phi(directory: Path, evaluation: EvaluationConfig | None = None) -> tuple[experiment.Experiment, dict]:

@@ -206,7 +206,15 @@ def test_the_vertices_that_a_stack_reaches(edges, level):
     assert config.Stack(edges, 1).lowest_level == level
 
 
+@pytest.mark.parametrize(
+    "setting, said", [({"blendshape_rate": 0.1}, "stage1.blendshape_rate"), ({"start_timestep": 0.3}, "time step")]
+)
+def test_tuning_refuses_what_it_would_ignore(setting, said):
+    with pytest.raises(ValueError, match=said):
+        config.TuningConfig(steps=10, **setting)
+
+
 @pytest.mark.parametrize("setting", ["rounds", "sequences", "frames", "descent_steps"])
-def test_tuning_needs_at_least_one_of_each(setting):
-    with pytest.raises(ValueError, match=rf"tuning\.{setting} must be >= 1, got 0"):
-        config.TuningConfig(**{setting: 0})
+def test_a_refinement_needs_at_least_one_of_each(setting):
+    with pytest.raises(ValueError, match=rf"refinement\.{setting} must be >= 1, got 0"):
+        config.RefinementConfig(**{setting: 0})

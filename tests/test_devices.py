@@ -17,7 +17,8 @@ import yaml
 from toy import assert_same, small
 
 from clothjax import checkpoint, configuration, devices
-from clothjax.config import TuningConfig
+from clothjax.config import RefinementConfig, TuningConfig
+from clothjax.trained import STAGES
 from experiments import train
 
 ROOT = Path(__file__).parents[1]
@@ -97,7 +98,8 @@ def config(tmp_path_factory):
         config,
         stage1=dataclasses.replace(config.stage1, steps=20, pool=8, batch=4, restart_probability=0.5),
         stage2=dataclasses.replace(config.stage2, steps=20, batch=4, sequences=3),
-        tuning=TuningConfig(steps=20, rounds=1, sequences=2, frames=4, batch=4),
+        tuning=TuningConfig(steps=20, batch=4, pool=8),
+        refinement=RefinementConfig(steps=20, rounds=1, sequences=2, frames=4, batch=4),
     )
     path = tmp_path_factory.mktemp("several") / "small.yaml"
     path.write_text(yaml.safe_dump(json.loads(json.dumps(configuration.to_dict(config)))))
@@ -152,7 +154,7 @@ for one, four in zip(teachers[0], teachers[1], strict=True):
 def test_a_batch_of_any_stage_that_cannot_be_divided_is_refused_before_training(config, monkeypatch, tmp_path):
     one = jax.devices()[0]
     monkeypatch.setattr(devices.jax, "devices", lambda: [one] * 4)
-    for stage in ("stage1", "stage2", "tuning"):
+    for stage in STAGES:
         with pytest.raises(ValueError, match=r"cannot be divided among 4 devices: .* tuning\.batch"):
             train.main([str(config), "--directory", str(tmp_path), "--devices", "4", f"--{stage}.batch", "6"])
     assert not list(tmp_path.iterdir())
@@ -181,8 +183,8 @@ def pair(config, directory, *arguments):
 
 
 def trained(directory):
-    """What a training left: the parameters of Phi, of Psi and of Psi after its tuning."""
-    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in ("stage1", "stage2", "tuning")]
+    """What a training left: the parameters of Phi, of Psi, and of Psi after its tuning and its refinement."""
+    return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in STAGES]
 
 
 @pytest.mark.slow

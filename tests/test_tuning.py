@@ -1,4 +1,4 @@
-"""Psi in training is Psi in use, and tuning it on the physics of its closed loops helps."""
+"""Psi in training is Psi in use, and training it on the physics helps."""
 
 import dataclasses
 
@@ -6,24 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import assert_same, small
+from toy import small
 
-from clothjax import (
-    blendshapes,
-    compact_latent,
-    experiment,
-    garment_model,
-    inference,
-    latent_predictor,
-    sampling,
-    stage1,
-    tuning,
-)
+from clothjax import blendshapes, compact_latent, experiment, garment_model, inference, latent_predictor, stage1, tuning
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax.config import TuningConfig
+from clothjax.config import Config, LossConfig, Ramp, TuningConfig
 from clothjax.latent_predictor import Normalizers, Scale
-from clothjax.tuning import Frames, Frozen
 from clothjax.types import ClothState, Pose
 
 SIZE = 9
@@ -36,19 +25,18 @@ def toy():
     config = dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, latent=SIZE),
-        tuning=TuningConfig(steps=160, rounds=2, sequences=4, frames=12, batch=16, learning_rate=3e-3, ema=0.9),
+        tuning=TuningConfig(steps=40, pool=2, learning_rate=3e-3, restart_probability=0.0),
     )
     whole = experiment.assemble(config)
     reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
     left, channels = compact_latent.latent_size(whole.scene, config.model)
-    size = left * channels
     kept = latent_predictor.kept_joints(whole.names, config.stage2)
     count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
     constants = latent_predictor.constant_inputs(jnp.zeros(10), experiment.material(config), config.material)
     garment = garment_model.init(
-        jax.random.key(0), size, 0.1 * blendshapes.laplacian(whole.scene, config), config.model
+        jax.random.key(0), left * channels, 0.1 * blendshapes.laplacian(whole.scene, config), config.model
     )
-    predictor = latent_predictor.init(jax.random.key(1), size, count, len(constants), config.stage2)
+    predictor = latent_predictor.init(jax.random.key(1), left * channels, count, len(constants), config.stage2)
     rng = np.random.default_rng(0)
 
     def scale(size, limit):
@@ -56,23 +44,11 @@ def toy():
         return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
 
     # codes of an untrained network stay near zero: some of them are out of so narrow a range
-    narrow = Normalizers(scale(size, 0.1), scale(count, 1e6))
-    inverse = stage1.rest_inverse_hessian(garment, whole.scene, config)
-    return whole, reel, kept, predictor, Frozen(garment, narrow, inverse)
-
-
-@pytest.fixture(scope="module")
-def wide(toy):
-    """The same, whose codes may be anything."""
-    whole, reel, kept, predictor, frozen = toy
-    size, count = len(frozen.normalizers.latent.mean), len(frozen.normalizers.pose.mean)
-    ranges = (Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6)) for n in (size, count))
-    return whole, reel, kept, predictor, frozen._replace(normalizers=Normalizers(*ranges))
+    return whole, reel, kept, garment, predictor, Normalizers(scale(left * channels, 0.1), scale(count, 1e6))
 
 
 def test_psi_in_training_is_psi_in_use(toy):
-    whole, _, kept, predictor, frozen = toy
-    garment, normalizers, _ = frozen
+    whole, _, kept, garment, predictor, normalizers = toy
     config, betas = whole.config, jnp.linspace(-1, 1, 10)
     model = inference.build(
         config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=betas
@@ -87,154 +63,96 @@ def test_psi_in_training_is_psi_in_use(toy):
     assert at_bounds.any() and not at_bounds.all() and not following.ok
 
     character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
-    animate = tuning.psi(predictor, frozen, whole.scene, character, kept, config)
+    animate = tuning.psi(garment, normalizers, kept)({"params": predictor}, whole.scene, character, config)
     around = motion.poses(jax.tree.map(jnp.asarray, experiment.windows(clip)), 2)
     window = characters.window(whole.scene, character, around)
     code = latent_predictor.denormalise(normalizers.latent, state.latent)
     cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code)
-    new, latent, (before, *_) = jax.jit(lambda c: animate(c, around, window, None, None))(cloth)
-    np.testing.assert_allclose(before, state.latent, atol=1e-5)
+    new, latent, seen = jax.jit(lambda c: animate(c, around, window, None, None))(cloth)
+    assert seen is None
     np.testing.assert_allclose(latent_predictor.normalise(normalizers.latent, latent), following.latent, atol=1e-5)
     np.testing.assert_allclose(new + pose[2].translation[None], vertices, atol=2e-5)
 
 
-def played(wide, predictor, seed=5):
-    whole, reel, kept, _, frozen = wide
-    return sampling.sample(
-        tuning.make_rollout(whole.scene, kept, whole.config),
-        (predictor, frozen, reel),
-        whole.config.tuning.sequences,
-        seed,
+def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
+    whole, reel, kept, garment, predictor, normalizers = toy
+    normalizers = Normalizers(*(
+        Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6))
+        for n in (len(normalizers.latent.mean), len(normalizers.pose.mean))
+    ))  # fmt: skip
+    config = tuning.settings(whole.config)
+    state = tuning.init(predictor, whole.scene, reel, whole.config)
+    assert jax.tree.structure(state.params) == jax.tree.structure(predictor) and not state.statistics
+    update = stage1.make_update(whole.scene, reel, config, 1, 40, animator=tuning.psi(garment, normalizers, kept))
+    state, metrics = update(state)
+    assert np.isfinite(metrics["loss"]).all() and int(state.step) == 40
+    # the same simulations once more, by the predictor that they have trained
+    _, again = update(tuning.init(state.params, whole.scene, reel, whole.config))
+    assert np.mean(again["loss"]) < 0.95 * np.mean(metrics["loss"])
+
+
+def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
+    whole, reel, kept, garment, predictor, normalizers = toy
+    config, betas = whole.config, jnp.linspace(-1, 1, 10)
+    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
+    poses = motion.poses(reel, 5)
+    window = characters.window(whole.scene, character, poses)
+    size = len(normalizers.latent.mean)
+    root = np.random.default_rng(0).normal(size=(size, size))
+    inverse = root @ root.T + np.eye(size)
+    last = max(name for name in predictor if name.startswith("dense"))
+    cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), jnp.zeros(size))
+
+    def found(inverse):
+        make = tuning.psi(garment, normalizers, kept, inverse, 0.5)
+
+        def energy(bias):
+            params = predictor | {last: predictor[last] | {"bias": bias}}
+            new, code, _ = make({"params": params}, whole.scene, character, config)(cloth, poses, window, None, None)
+            return jnp.sum((new - 1.0) ** 2), code
+
+        return jax.jit(jax.value_and_grad(energy, has_aux=True))(predictor[last]["bias"])
+
+    (plain, code), gradient = found(None)
+    (same, same_code), preconditioned = found(inverse)
+    assert plain == same and (code == same_code).all()
+    expected = tuning.preconditioner(inverse, normalizers, 0.5) @ gradient
+    np.testing.assert_allclose(preconditioned, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
+    assert float(jnp.abs(expected - gradient).max()) > 0.1 * float(jnp.abs(gradient).max())
+
+
+def test_preconditioned_gradients_point_to_the_minimum():
+    rng = np.random.default_rng(0)
+    basis, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    stiffness = (basis * np.geomspace(1e-2, 1e2, 6)) @ basis.T  # J
+    deviation = rng.uniform(0.5, 2.0, 6)
+    scale = Scale(jnp.zeros(6), jnp.asarray(deviation, jnp.float32), -jnp.ones(6), jnp.ones(6))
+    code, best = jnp.asarray(rng.normal(size=6), jnp.float32), jnp.asarray(rng.normal(size=6), jnp.float32)
+
+    def energy(code, matrix=None):
+        code = code if matrix is None else tuning.precondition(matrix, code)
+        apart = (code - best) * scale.deviation
+        return 0.5 * apart @ jnp.asarray(stiffness, jnp.float32) @ apart
+
+    def alignment(power):
+        matrix = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), power)
+        assert energy(code, matrix) == energy(code)
+        gradient, way = jax.grad(energy)(code, matrix), code - best
+        return float(gradient @ way / jnp.linalg.norm(gradient) / jnp.linalg.norm(way))
+
+    assert alignment(1.0) > 0.999
+    assert alignment(0.0) < alignment(0.5) < alignment(1.0)
+    plain = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
+    np.testing.assert_allclose(plain, np.eye(6), atol=1e-5)
+
+
+def test_tuning_has_the_last_loss_weights_and_the_bodies_of_stage_1():
+    config = dataclasses.replace(
+        Config(),
+        loss=LossConfig(collision=Ramp(0.05, 80.0, 0, 1000), inertia=Ramp(3.0)),
+        stage1=dataclasses.replace(Config().stage1, betas=1.25),
+        tuning=TuningConfig(steps=10, rollout=3),
     )
-
-
-def test_what_psi_should_have_predicted_costs_less_energy(wide):
-    frames = played(wide, wide[3])
-    assert frames.codes.shape[:2] == frames.gain.shape == (4, 12)
-    assert (frames.codes[:, 0] == 0).all()  # before its first frame
-    assert (frames.gain[:, 3:] > 0).all()
-    # Psi goes on from what it has predicted, not from what it should have
-    decay = wide[0].config.stage2.latent_decay
-    each = jax.vmap(jax.vmap(lambda *row: latent_predictor.predict(wide[3], *row, decay)))
-    predicted = each(frames.codes, frames.poses, frames.constants)
-    np.testing.assert_allclose(predicted[:, :-1], frames.codes[:, 1:], atol=1e-4)
-    assert np.abs(frames.better[:, :-1] - frames.codes[:, 1:]).max() > 1e-2
-
-
-def test_tuning_lowers_the_energy_of_closed_loops(wide, tmp_path):
-    whole, reel, kept, predictor, frozen = wide
-    update = tuning.make_update(whole.scene, reel, kept, frozen, whole.config, tmp_path, 80)
-    state = tuning.init(predictor, whole.config)
-    for _ in range(2):
-        state, metrics = update(state)
-        assert np.isfinite(metrics["loss"]).all() and metrics["loss"].shape == (80,)
-    assert int(state.step) == 160 and sorted(path.name for path in (tmp_path / tuning.ROUNDS).iterdir()) == [
-        "000.npz",
-        "001.npz",
-    ]
-    before, after = (np.median(played(wide, params, seed=11).gain) for params in (predictor, state.average))
-    assert after < 0.7 * before
-
-
-def test_an_interrupted_tuning_goes_on_bit_for_bit(wide, tmp_path):
-    whole, reel, kept, predictor, frozen = wide
-
-    def updates(directory):
-        return tuning.make_update(whole.scene, reel, kept, frozen, whole.config, directory, 40)
-
-    def taken(update, state, calls):
-        for _ in range(calls):
-            state, _ = update(state)
-        return jax.device_get(state)
-
-    at_once = taken(updates(tmp_path / "one"), tuning.init(predictor, whole.config), 4)
-    # stopped in the middle of the second round, whose frames are then in its file
-    half = taken(updates(tmp_path / "two"), tuning.init(predictor, whole.config), 3)
-    assert_same(at_once, taken(updates(tmp_path / "two"), jax.tree.map(jnp.array, half), 1))
-
-    (tmp_path / "two" / tuning.ROUNDS / "000.npz").unlink()
-    with pytest.raises(ValueError, match=r"000\.npz is gone"):
-        updates(tmp_path / "two")(jax.tree.map(jnp.array, half))
-    path = tmp_path / "two" / tuning.ROUNDS / "001.npz"
-    (tmp_path / "one" / tuning.ROUNDS / "000.npz").rename(tmp_path / "two" / tuning.ROUNDS / "000.npz")
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ValueError, match=r"001\.npz is damaged"):
-        updates(tmp_path / "two")(jax.tree.map(jnp.array, half))
-
-
-def test_rounds_follow_each_other_and_the_last_has_the_most_steps():
-    turns = tuning.schedule(TuningConfig(steps=1000, rounds=8), 10)
-    assert len(turns) == 100 and turns[0] == 0 and turns[-1] == 7
-    assert set(np.diff(turns)) == {0, 1}
-    counts = np.bincount(turns)
-    assert (np.diff(counts[1:]) >= 0).all() and counts[-1] >= 60
-    assert tuning.schedule(TuningConfig(steps=60, rounds=8), 20) == [0, 1, 2]  # no round is left out
-
-
-def test_frames_without_a_lesson_are_left_out():
-    gain = np.array([[1.0, 2.0, 3.0, np.nan], [-1.0, 1e3, 2.0, 2.0]])
-    better = np.arange(8.0).reshape(2, 4, 1)
-    better[1, 3] = np.inf
-    rows = np.zeros((2, 4, 1))
-    left = tuning.worth(Frames(rows, rows, rows, better, gain))
-    np.testing.assert_array_equal(left.gain, [1, 2, 3, -1, 2])
-    np.testing.assert_array_equal(left.better[:, 0], [0, 1, 2, 4, 6])
-
-
-def test_an_error_of_the_code_costs_its_energy_and_the_displacement_of_vertices(toy):
-    whole, _, _, predictor, frozen = toy
-    rng = np.random.default_rng(0)
-    latent, count = frozen.normalizers.latent, len(frozen.normalizers.pose.mean)
-    size = len(latent.mean)
-    root = rng.normal(size=(size, size))
-    hessian = root @ root.T + np.eye(size)  # of codes as they are
-    frozen = frozen._replace(inverse=np.linalg.inv(hessian))
-    rows = (rng.normal(size=(5, n)).astype(np.float32) for n in (size, count, 14, size))
-    frames = Frames(*rows, np.ones(5, np.float32))
-    decay = whole.config.stage2.latent_decay
-    predicted = jax.vmap(lambda *row: latent_predictor.predict(predictor, *row, decay))(*frames[:3])
-    # so near that the decoder is linear
-    frames = frames._replace(codes=0 * frames.codes, better=0 * frames.better)
-    predicted = 1e-3 * predicted
-    apart = np.asarray(predicted) * np.asarray(latent.deviation)
-
-    def found(stiffness):
-        tuned = dataclasses.replace(whole.config.tuning, vertex_stiffness=stiffness)
-        cost = np.asarray(tuning.metric(frozen, dataclasses.replace(whole.config, tuning=tuned)))
-        return 0.5 * np.einsum("bi,ij,bj->b", predicted, cost, predicted)
-
-    energy = 0.5 * np.einsum("bi,ij,bj->b", apart, hessian, apart)
-    np.testing.assert_allclose(found(0.0), energy, rtol=1e-4)
-
-    def displacement(code):
-        code = latent_predictor.denormalise(latent, code)
-        return garment_model.displacement(
-            frozen.garment, code, jnp.ones(len(whole.garment.vertices)), whole.config.model
-        )
-
-    moved = jax.vmap(lambda code: displacement(code) - displacement(jnp.zeros(size)))(predicted)
-    squared = np.mean(np.sum(np.asarray(moved, np.float64) ** 2, axis=-1), axis=-1)
-    np.testing.assert_allclose(found(1e6) - found(0.0), 1e6 * squared, rtol=1e-2)
-
-
-def test_the_loss_is_the_cost_of_what_is_predicted(toy):
-    whole, _, _, predictor, frozen = toy
-    rng = np.random.default_rng(0)
-    size, count = len(frozen.normalizers.latent.mean), len(frozen.normalizers.pose.mean)
-    rows = (jnp.asarray(rng.normal(size=(5, n)), jnp.float32) for n in (size, count, 14, size))
-    frames, cost = Frames(*rows, jnp.ones(5)), tuning.metric(frozen, whole.config)
-    decay = whole.config.stage2.latent_decay
-    predicted = jax.vmap(lambda *row: latent_predictor.predict(predictor, *row, decay))(*frames[:3])
-    apart = np.asarray(predicted - frames.better, np.float64)
-    expected = 0.5 * np.einsum("bi,ij,bj->b", apart, np.asarray(cost, np.float64), apart)
-    np.testing.assert_allclose(tuning.excess(predictor, frames, cost, whole.config), expected, rtol=1e-4)
-    assert (tuning.excess(predictor, frames._replace(better=predicted), cost, whole.config) == 0).all()
-
-
-def test_few_large_errors_do_not_outweigh_the_others():
-    energies = jnp.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    assert tuning.robust(7.0 * energies) == pytest.approx(float(tuning.robust(energies)), rel=1e-5)
-    # where all are alike it is their mean over the median, nearly
-    assert tuning.robust(jnp.full(5, 0.3)) == pytest.approx(1.0, rel=0.1)
-    weight = jax.grad(tuning.robust)(energies.at[4].set(5e4))
-    assert (weight > 0).all() and weight[4] < 0.1 * weight[1]
+    used = tuning.settings(config)
+    assert used.loss.collision == Ramp(80.0) and used.loss.inertia == Ramp(3.0) and used.loss.scale == config.loss.scale
+    assert used.stage1.betas == 1.25 and used.stage1.rollout == 3 and used.stage1.learning_rate == 1.5e-4
