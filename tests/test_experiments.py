@@ -131,16 +131,7 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
 
 def test_a_packed_garment_is_refined_on_other_motions(finished, tmp_path):
     trained.pack(finished, tmp_path / "packed")
-    settings = [
-        "--motions",
-        "dance_0",
-        "--tuning.steps",
-        "20",
-        "--tuning.rounds",
-        "1",
-        "--tuning.learning-rate",
-        "1e-2",
-    ]
+    settings = ["--motions", "dance_0", "--refinement.steps", "20", "--refinement.rounds", "1"]
     refine.main([str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings])
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))
     assert config.motions == ("dance_0",) and config.refinement.steps == 20 and before.refinement.steps == 40
