@@ -192,3 +192,14 @@ def test_pushforward_has_no_gradient_through_its_own_steps():
     )["dense_0"]["kernel"]  # fmt: skip
     np.testing.assert_allclose(gradient(True, 0.0), last, rtol=1e-3, atol=1e-4 * float(jnp.abs(last).max()))
     assert not np.allclose(gradient(False, 0.3), gradient(False, 0.0))
+
+
+def test_a_widened_range_holds_what_was_seen_since():
+    rng = np.random.default_rng(0)
+    scale = latent_predictor.measure(rng.normal(size=(50, 3)))
+    more = np.array([[10.0, 0.0, -10.0]])
+    wide = latent_predictor.widened(scale, more)
+    row = latent_predictor.normalise(wide, more[0])
+    assert ((wide.low <= row + 1e-6) & (row <= wide.high + 1e-6)).all()
+    np.testing.assert_array_equal(wide.mean, scale.mean)
+    assert wide.low[0] == scale.low[0] and wide.high[2] == scale.high[2] and wide.high[1] == scale.high[1]
