@@ -267,8 +267,7 @@ class TuningConfig(Stage1Config):
 @dataclass(frozen=True)
 class RefinementConfig:
     """Training of Psi on what the physics says it should have predicted in its own closed loops
-    (`clothjax/refinement.py`). Bodies and
-    materials are those of stage 1."""
+    (`clothjax/refinement.py`). Bodies and materials are those of stage 1."""
 
     steps: int = 0
     rounds: int = 20
@@ -282,8 +281,8 @@ class RefinementConfig:
     noise: float = 0.1
     """Standard deviation of the noise on codes that are read, in theirs, so that Psi learns to come back."""
     vertex_stiffness: float = 650.0
-    """J/m^2. So much more than its energy an error of a code costs for the mean squared displacement of vertices: soft
-    ways to move, where energy hardly tells right from wrong, are else learnt badly, and lead astray."""
+    """J/m^2. So much more than its energy an error of a code costs for the mean squared displacement of vertices: for
+    soft ways to move, where energy hardly tells right from wrong."""
     batch: int = 256
     learning_rate: float = 3e-4
     clip: float = 1.0

@@ -99,6 +99,39 @@ def predict(params: Params, latent: Array, pose: Array, constants: Array, decay:
     return (1.0 - decay) * latent + mlp(params, jnp.concatenate([latent, pose, constants]))
 
 
+class Inputs(NamedTuple):
+    """What the network reads, in standard deviations."""
+
+    code: Array  # [L]
+    pose: Array  # [P]
+    constants: Array  # [C]
+
+
+def advance(
+    params: Params,
+    code: Array,
+    poses: Pose,
+    joints: Array,
+    constants: Array,
+    parents: np.ndarray,
+    kept: np.ndarray,
+    normalizers: Normalizers,
+    config: Config,
+) -> tuple[Array, Inputs]:
+    """The next code [L] in standard deviations, brought into its range as in use, and what it was predicted from.
+
+    Args:
+        code: [L] as it is; poses: a window of three; joints: [J, 3] m, of the shaped body; constants: [C].
+
+    Gradients pass as if nothing had been out of range.
+    """
+    pose = window_inputs(poses, joints, parents, kept, config.fps)
+    inputs = Inputs(normalise(normalizers.latent, code), normalise(normalizers.pose, pose), constants)
+    latent = predict(params, *inputs, config.stage2.latent_decay)
+    inside, _ = bounded(latent, normalizers.latent.low, normalizers.latent.high)
+    return latent + jax.lax.stop_gradient(inside - latent), inputs
+
+
 def normalise(scale: Scale, row: Array) -> Array:
     """A row [N] in standard deviations from the mean."""
     return (row - scale.mean) / scale.deviation

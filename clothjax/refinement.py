@@ -8,7 +8,6 @@ comes from the physics alone.
 
 import math
 import sys
-import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,12 +21,13 @@ from jax.sharding import Mesh
 from tqdm import tqdm
 
 from clothjax import clips as motion
-from clothjax import compact_latent, devices, fit, garment_model, latent_predictor, rollout, sampling, stage1
+from clothjax import compact_latent, devices, fit, garment_model, latent_predictor, rollout, sampling, stage1, storage
 from clothjax.character import Character, Window
 from clothjax.clips import Clips
 from clothjax.config import Config, RefinementConfig
 from clothjax.fit import Weights
 from clothjax.latent_predictor import Normalizers
+from clothjax.losses import TimeStep
 from clothjax.rollout import Animator
 from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Pose
@@ -36,7 +36,6 @@ LOST = 30.0  # times the median gain: cloth that has gone into the body, from wh
 ROBUST = 40.0  # times the median of a batch: the error from which on it counts by its root
 PLAYED = 0.4  # of the steps, over which the rounds are spread
 ROUNDS = "rounds"  # the folder of their files
-UNREADABLE = (ValueError, LookupError, OSError, EOFError, zipfile.BadZipFile)
 
 
 class Frozen(NamedTuple):
@@ -89,56 +88,43 @@ def optimizer(config: Config) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(settings.clip), optax.adam(rate, b2=0.99))
 
 
-def psi(predictor: dict, frozen: Frozen, scene: Scene, character: Character, kept: np.ndarray, config: Config):
-    """Psi as what moves a character's garment (an `Animator`), which tells its inputs too: (code, pose, constants).
+def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
+    """A function of a key, the predictor, `Frozen` and clips: the frames [T] of one closed loop of Psi.
 
     Args:
         kept: joints that are inputs.
     """
-    normalizers = frozen.normalizers
-    constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
-
-    def animate(state: ClothState, poses: Pose, window: Window, _step, _potential: Callable):
-        inputs = latent_predictor.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
-        inputs = latent_predictor.normalise(normalizers.pose, inputs)
-        latent = latent_predictor.normalise(normalizers.latent, state.latent)
-        next_latent = latent_predictor.predict(predictor, latent, inputs, constants, config.stage2.latent_decay)
-        next_latent, _ = latent_predictor.bounded(next_latent, normalizers.latent.low, normalizers.latent.high)
-        code = latent_predictor.denormalise(normalizers.latent, next_latent)
-        new = compact_latent.decode({"garment": frozen.garment}, scene, character, code, window, config.model)
-        return new, code, (latent, inputs, constants)
-
-    return animate
-
-
-def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
-    """A function of a key, the predictor, `Frozen` and clips: the frames [T] of one closed loop of Psi, corrected."""
     settings = config.refinement
 
-    def corrected(animate: Animator, frozen: Frozen, character: Character) -> Animator:
-        def correct(state: ClothState, poses: Pose, window: Window, step, potential: Callable):
-            new, code, inputs = animate(state, poses, window, step, potential)
+    def psi(predictor: dict, frozen: Frozen, character: Character) -> Animator:
+        """Psi, of which `Frames` are seen."""
+        scale = frozen.normalizers.latent
+        constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
+
+        def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, potential: Callable):
+            latent, inputs = latent_predictor.advance(
+                predictor, state.latent, poses, character.joints, constants, scene.body.parents, kept,
+                frozen.normalizers, config,
+            )  # fmt: skip
 
             def garment(code):
                 return compact_latent.decode({"garment": frozen.garment}, scene, character, code, window, config.model)
 
+            code = latent_predictor.denormalise(scale, latent)
+            new = garment(code)
             better = compact_latent.descend(
-                lambda g: frozen.inverse @ g,
-                code,
-                garment,
-                potential,
-                settings.descent_steps,
+                lambda g: frozen.inverse @ g, code, garment, potential, settings.descent_steps,
                 config.model.descent_bound,
-            )
+            )  # fmt: skip
             gain = potential(new) - potential(garment(better))
-            return new, code, Frames(*inputs, latent_predictor.normalise(frozen.normalizers.latent, better), gain)
+            return new, code, Frames(*inputs, latent_predictor.normalise(scale, better), gain)
 
-        return correct
+        return animate
 
     def sequence(key: Array, predictor: dict, frozen: Frozen, clips: Clips) -> Frames:
         simulation = stage1.begin(key, scene, clips, config)
         character = stage1.wearer(scene, simulation.betas, simulation.material, config)
-        animate = corrected(psi(predictor, frozen, scene, character, kept, config), frozen, character)
+        animate = psi(predictor, frozen, character)
 
         def frame(state, poses):
             taken, (_, _, seen) = rollout.take(animate, scene, character, state, poses, 1.0 / config.fps, config)
@@ -307,15 +293,15 @@ def _path(directory: Path, number: int) -> Path:
 
 def _write(path: Path, frames: Frames) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
+    unfinished = path.with_suffix(".partial")
+    with unfinished.open("wb") as file:
         np.savez(file, **frames._asdict())
-    partial.replace(path)
+    unfinished.replace(path)
 
 
 def _read(path: Path) -> Frames:
     try:
         with np.load(path, allow_pickle=False) as file:
             return Frames(*(file[name] for name in Frames._fields))
-    except UNREADABLE as error:
+    except storage.UNREADABLE as error:
         raise ValueError(f"{path} is damaged ({error}): remove {path.parents[1]}, and refine again") from error

@@ -21,6 +21,8 @@ On reading, any `format` that ends in /body, /garment or /motion will do, and fu
 """
 
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +35,8 @@ from scipy.spatial.transform import Rotation
 from clothjax.types import Body, Garment, Motion
 
 VERSION = 1
+# what readers of files raise where these are damaged or of another kind
+UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 ASSETS = Path(__file__).parent / "assets"
 
 

@@ -4,8 +4,6 @@ A packed model is a folder with `model.npz` and `config.yaml`. Large matrices ar
 each column (`NAME` and `NAME|scale`), the blend shapes and the preconditioner in half precision, all else as it is.
 """
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,6 @@ MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG = "model.npz", "config.yaml"
 STAGES = ("stage1", "stage2", "tuning", "refinement")
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
-UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 LARGE = 2000  # entries of a matrix that is worth eight bits
 
 
@@ -159,7 +156,7 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
                 node[last] = leaf.astype(np.float32)
         parts = checkpoint.lists(tree)
         return config, {name: parts[name] for name in ("phi", "statistics", "predictor", "normalizers")}
-    except UNREADABLE as error:
+    except storage.UNREADABLE as error:
         raise ValueError(
             f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"
         ) from error

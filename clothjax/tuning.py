@@ -74,17 +74,10 @@ def psi(
         constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
 
         def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, _potential: Callable):
-            inputs = latent_predictor.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
-            latent = latent_predictor.predict(
-                model["params"],
-                latent_predictor.normalise(normalizers.latent, state.latent),
-                latent_predictor.normalise(normalizers.pose, inputs),
-                constants,
-                config.stage2.latent_decay,
-            )
-            # in range as in use, where there is no gradient to lose
-            inside, _ = latent_predictor.bounded(latent, normalizers.latent.low, normalizers.latent.high)
-            latent = latent + jax.lax.stop_gradient(inside - latent)
+            latent, _ = latent_predictor.advance(
+                model["params"], state.latent, poses, character.joints, constants, scene.body.parents, kept,
+                normalizers, config,
+            )  # fmt: skip
             shown = latent if matrix is None else precondition(matrix, latent)
             code, shown = (latent_predictor.denormalise(normalizers.latent, z) for z in (latent, shown))
             new = compact_latent.decode({"garment": garment}, scene, character, shown, window, config.model)

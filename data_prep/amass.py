@@ -6,7 +6,6 @@ SMPL's poses are relative to a T-pose, so no skeleton of who was recorded is nee
 files are up in z; of others, say so with --up y.
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,7 +15,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from clothjax.plausibility import bad_frames
-from clothjax.storage import canonical_rotation, joint_names, load_body, save_motion
+from clothjax.storage import UNREADABLE, canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
 from data_prep.smpl import BODY
@@ -39,7 +38,7 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
             poses, trans, fps = (np.asarray(file[key], np.float64) for key in ("poses", "trans", rate))
     except FileNotFoundError:
         raise
-    except (ValueError, OSError, EOFError, TypeError, LookupError, zipfile.BadZipFile, MemoryError) as error:
+    except (MemoryError, *UNREADABLE) as error:
         raise ValueError(f"{path}: not a motion of AMASS: {error}") from error
     if poses.ndim == 3:
         poses = poses.reshape(len(poses), -1)

@@ -10,7 +10,6 @@ and nothing in it is run: of what pickle can build only arrays, numbers and text
 import codecs
 import copyreg
 import pickle
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import numpy as np
 import scipy.sparse
 import tyro
 
-from clothjax.storage import save_body
+from clothjax.storage import UNREADABLE, save_body
 from clothjax.types import Body
 
 BODY = (
@@ -96,15 +95,12 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
             found = {key: _array(whole[key]) for key in (*KEYS, "posedirs") if key in whole}
     except FileNotFoundError:
         raise
-    except (ValueError, pickle.UnpicklingError, zipfile.BadZipFile, *_BROKEN) as error:
+    except (pickle.UnpicklingError, OverflowError, MemoryError, *UNREADABLE) as error:
         raise ValueError(f"{path}: not a body model of the SMPL family: {error}") from error
     missing = [key for key in KEYS if key not in found]
     if missing:
         raise ValueError(f"{path}: has no {', '.join(missing)}: is it a body model of the SMPL family?")
     return found
-
-
-_BROKEN = (EOFError, OSError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, ImportError)
 
 
 def _array(value) -> np.ndarray:

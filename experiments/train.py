@@ -116,8 +116,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         # were it not readable, training would go on from the one before, and stop at the first NaN
         teacher, seconds = stage2.blank(model, whole.scene, reel, joints, config), 0.0
     else:
-        if checkpoint.steps(directory / "tuning" / "checkpoints"):
-            raise ValueError(f"{directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
+        _refuse_later(directory, "stage 2", "tuning", "refinement")
         with progress("rolling out the teacher", config.stage2.sequences) as report:
             teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
     garment = jax.device_get(first.state.average["garment"])
@@ -140,18 +139,25 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     }
     predictor = second.state.average
     if config.tuning.steps > 0:
+        if not checkpoint.steps(directory / "tuning" / "checkpoints"):
+            _refuse_later(directory, "tuning", "refinement")
         third = _tune(whole, reel, model["params"], second.state, directory, device_mesh)
         predictor = third.state.average
         clock["compile_seconds"] += third.compile_seconds
         clock["tuning_seconds"] = third.seconds
     if config.refinement.steps > 0:
-        if config.tuning.steps == 0 and checkpoint.steps(directory / "tuning" / "checkpoints"):
-            raise ValueError(f"{directory / 'tuning'} is of other settings: remove it")
         normalizers = second.state.normalizers
         fourth = refine(whole, reel, model["params"], garment, predictor, normalizers, directory, device_mesh)
         clock["compile_seconds"] += fourth.compile_seconds
         clock["refinement_seconds"] = fourth.seconds
     return clock
+
+
+def _refuse_later(directory: Path, stage: str, *later: str) -> None:
+    """Where a stage begins, what was trained on an earlier one of it must not be taken for its own."""
+    for name in later:
+        if checkpoint.steps(directory / name / "checkpoints"):
+            raise ValueError(f"{directory / name} belongs to a {stage} that is no longer there: remove it")
 
 
 def _tune(

@@ -127,6 +127,13 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
     shutil.rmtree(run / "stage2")
     with pytest.raises(ValueError, match="tuning belongs to a stage 2 that is no longer there"):
         train.train(trained.phi(run)[0], run)
+    shutil.rmtree(run / "tuning")
+    shutil.copytree(finished / "refinement", run / "refinement")
+    with pytest.raises(ValueError, match="refinement belongs to a stage 2 that is no longer there"):
+        train.train(trained.phi(run)[0], run)
+    shutil.copytree(finished / "stage2", run / "stage2")
+    with pytest.raises(ValueError, match="refinement belongs to a tuning that is no longer there"):
+        train.train(trained.phi(run)[0], run)
 
 
 def test_a_packed_garment_is_refined_on_other_motions(finished, tmp_path):

@@ -6,45 +6,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import small
+from toy import small, untrained_psi
 
-from clothjax import blendshapes, compact_latent, experiment, garment_model, inference, latent_predictor, stage1, tuning
 from clothjax import character as characters
 from clothjax import clips as motion
+from clothjax import experiment, inference, latent_predictor, stage1, tuning
 from clothjax.config import Config, LossConfig, Ramp, TuningConfig
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import ClothState, Pose
-
-SIZE = 9
 
 
 @pytest.fixture(scope="module")
 def toy():
     """An untrained Psi, and all it is made of."""
-    config = dataclasses.replace(small(), motions=("walk_0",))
     config = dataclasses.replace(
-        config,
-        model=dataclasses.replace(config.model, latent=SIZE),
-        tuning=TuningConfig(steps=40, pool=2, learning_rate=3e-3, restart_probability=0.0),
+        small(), tuning=TuningConfig(steps=40, pool=2, learning_rate=3e-3, restart_probability=0.0)
     )
-    whole = experiment.assemble(config)
-    reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
-    left, channels = compact_latent.latent_size(whole.scene, config.model)
-    kept = latent_predictor.kept_joints(whole.names, config.stage2)
-    count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
-    constants = latent_predictor.constant_inputs(jnp.zeros(10), experiment.material(config), config.material)
-    garment = garment_model.init(
-        jax.random.key(0), left * channels, 0.1 * blendshapes.laplacian(whole.scene, config), config.model
-    )
-    predictor = latent_predictor.init(jax.random.key(1), left * channels, count, len(constants), config.stage2)
-    rng = np.random.default_rng(0)
-
-    def scale(size, limit):
-        rows = (0.1 * rng.normal(size=size), rng.uniform(0.5, 2.0, size), np.full(size, -limit), np.full(size, limit))
-        return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
-
-    # codes of an untrained network stay near zero: some of them are out of so narrow a range
-    return whole, reel, kept, garment, predictor, Normalizers(scale(left * channels, 0.1), scale(count, 1e6))
+    return untrained_psi(config)
 
 
 def test_psi_in_training_is_psi_in_use(toy):

@@ -52,3 +52,33 @@ def assert_same(one, other) -> None:
         if jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
             a, b = jax.random.key_data(a), jax.random.key_data(b)
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def untrained_psi(config: Config):
+    """An untrained Psi with nine code channels on one clip, and all it is made of: the experiment, the reel, the joints
+    that are inputs, the decoder with blend shapes, the predictor, and normalizers."""
+    import jax
+    import jax.numpy as jnp
+
+    from clothjax import blendshapes, compact_latent, experiment, garment_model, latent_predictor
+    from clothjax.latent_predictor import Normalizers, Scale
+
+    config = dataclasses.replace(config, motions=("walk_0",), model=dataclasses.replace(config.model, latent=9))
+    whole = experiment.assemble(config)
+    reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
+    left, channels = compact_latent.latent_size(whole.scene, config.model)
+    size = left * channels
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
+    constants = latent_predictor.constant_inputs(jnp.zeros(10), experiment.material(config), config.material)
+    shapes = 0.1 * blendshapes.laplacian(whole.scene, config)
+    garment = garment_model.init(jax.random.key(0), size, shapes, config.model)
+    predictor = latent_predictor.init(jax.random.key(1), size, count, len(constants), config.stage2)
+    rng = np.random.default_rng(0)
+
+    def scale(size, limit):
+        rows = (0.1 * rng.normal(size=size), rng.uniform(0.5, 2.0, size), np.full(size, -limit), np.full(size, limit))
+        return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
+
+    # codes of an untrained network stay near zero: some of them are out of so narrow a range
+    return whole, reel, kept, garment, predictor, Normalizers(scale(size, 0.1), scale(count, 1e6))
