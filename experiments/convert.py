@@ -2,11 +2,13 @@
 
     python -m experiments.convert runs/quickstart --to onnx --int8
     python -m experiments.convert --pretrained skirt --to stablehlo --out skirt.stablehlo
+    python -m experiments.convert --pretrained dress --to c --out engine/dress.psi
     python -m experiments.convert --pretrained tshirt --to onnx --batch dynamic --blendshapes 192 --betas 1 0 -0.5
 
     onnx          ONNX Runtime 1.15 and newer, and engines built on it; for eight bits, --int8; to skin the garment in
                   the engine, --output canonical; for a garment that nobody sees, --output none
     stablehlo     any process with jax or XLA, on CPU, GPU or TPU, without clothjax
+    c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
     safetensors   the arrays alone, for whoever builds a runtime
 
 A JSON beside the file tells how it is driven. The model is specialised first (`clothjax/folding.py`). The distance of
@@ -16,12 +18,13 @@ vertices to jax's unspecialised model, over 300 frames of closed loop, is printe
 import argparse
 import json
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from clothjax import experiment, folding, inference, storage, trained
-from clothjax.export import onnx, safetensors, stablehlo
+from clothjax.export import native, onnx, safetensors, stablehlo
 from clothjax.inference import Model
 from clothjax.types import Material, Motion
 from experiments.session import fail_clearly, setup
@@ -33,7 +36,7 @@ def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run", type=Path, nargs="?", help="folder of a finished run")
     parser.add_argument("--pretrained", choices=trained.shipped())
-    parser.add_argument("--to", choices=["onnx", "stablehlo", "safetensors"], default="onnx")
+    parser.add_argument("--to", choices=["onnx", "stablehlo", "c", "safetensors"], default="onnx")
     parser.add_argument("--out", type=Path, default=None, help="default: GARMENT.onnx and so on, in the run's folder")
     parser.add_argument("--int8", action="store_true")
     parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
@@ -54,7 +57,8 @@ def main(argv: list[str]) -> None:
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
     material = None if arguments.material is None else Material(*arguments.material)
     model = inference.load(run, betas=betas, material=material)
-    out = arguments.out or (arguments.run or Path(".")) / f"{model.config.garment}.{arguments.to}"
+    suffix = "psi" if arguments.to == "c" else arguments.to
+    out = arguments.out or (arguments.run or Path(".")) / f"{model.config.garment}.{suffix}"
     convert(model, out, arguments)
 
 
@@ -75,12 +79,15 @@ def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
     elif arguments.to == "stablehlo":
         stablehlo.to_stablehlo(small, out, about)
         found = stablehlo.run_stablehlo(out, small, motion)
+    elif arguments.to == "c":
+        native.to_c(small, out, about)
+        found = _in_c(out, motion)
     else:
         safetensors.to_safetensors(small, out)
         found = np.asarray(inference.animate(safetensors.from_safetensors(out), motion)[0])
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
     if found is None:
-        print("its vertices are not in the world: not compared")
+        print("not compared: " + ("no C compiler" if arguments.to == "c" else "its vertices are not in the world"))
         return
     apart = 1e3 * np.linalg.norm(found - np.asarray(inference.animate(model, motion)[0]), axis=-1)
     error = {"frames": len(found), "mean_mm": float(apart.mean()), "max_mm": float(apart.max())}
@@ -90,6 +97,14 @@ def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
     if out.with_suffix(".json").is_file() and arguments.to != "safetensors":
         told = json.loads(out.with_suffix(".json").read_text())
         out.with_suffix(".json").write_text(json.dumps(told | {"distance_to_jax": error}))
+
+
+def _in_c(path: Path, motion: Motion) -> np.ndarray | None:
+    """Vertices [T, V, 3] m of a .psi; None on a machine without a C compiler."""
+    if native.compiler() is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        return native.run_c(native.build(folder), path, motion)
 
 
 def validation(model: Model) -> Motion:

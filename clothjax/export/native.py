@@ -1,0 +1,185 @@
+"""Plain C: the matrices of a model in eight bits for `psi.c`, which needs no runtime.
+
+A `.psi` is little-endian; every array in it begins at a multiple of 64 bytes. Of a matrix each row (what gives one
+output) has a scale of its own; its inputs `psi.c` quantises to sixteen bits, after a gain where they differ in scale.
+"""
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from clothjax.export import sidecar
+from clothjax.inference import Bounds, Layer, Model
+from clothjax.types import Array, Motion
+
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
+MAGIC = int.from_bytes(b"PSI\0", "little")
+VERSION = 1
+ALIGN = 64
+LANES = 64  # vertices that are skinned at once
+FLAGS = ("-O3", "-march=native")
+
+
+def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
+    """Writes a model for `psi.c`, and beside it a JSON that tells an engine how to drive it, `psi.c` and `psi.h`.
+
+    Args:
+        about: more entries for the JSON.
+    """
+    path = Path(path)
+    with path.open("wb") as file:
+        for array in _arrays(model):
+            data = array.astype(array.dtype.newbyteorder("<")).tobytes()
+            file.write(data + bytes(-len(data) % ALIGN))
+    sidecar.write(model, path, "world", {"driven": "by psi.c: see psi.h"} | (about or {}))
+    for source in SOURCES:
+        shutil.copyfile(source, path.parent / source.name)
+    return path
+
+
+def _arrays(model: Model) -> Iterator[np.ndarray]:
+    """All of a file in its order."""
+    network, wearer = model.network, model.wearer
+    code = len(network.first)
+    wide = len(network.decoder[0].kernel)
+    head = (
+        MAGIC, VERSION, len(model.parents), len(model.kept), len(model.moving), wearer.template.shape[1], code,
+        len(network.hidden), len(network.decoder), len(network.read.bias) > wide, model.config.model.blendshape_relu,
+        network.mix is not None, bool(wearer.known), 0, 0, 0,
+    )  # fmt: skip
+    yield np.array(head, np.int32)
+    yield np.array([model.config.fps, model.config.stage2.latent_decay], np.float32)
+    for integers in (model.parents, model.kept, model.moving):
+        yield np.array(integers, np.int32)
+    yield np.asarray(wearer.joints, np.float32)
+    weights = np.asarray(network.weights, np.float32)
+    yield np.pad(weights, [(0, 0), (0, -weights.shape[1] % LANES)])
+    yield np.asarray(network.pose_mean, np.float32)
+    yield from _bounds(network.pose_bounds, len(network.pose_mean))
+    yield from _bounds(network.code_bounds, code)
+    yield np.asarray(network.first, np.float32)
+    yield from _layer(Layer(network.pose, network.code.bias + wearer.bias), even=True)
+    yield from _layer(network.code._replace(bias=np.zeros(len(wearer.bias))))
+    for layer in network.hidden:
+        yield from _layer(layer)
+    yield from _layer(network.read, even=True)
+    for layer in network.decoder:
+        yield from _layer(layer)
+    if network.mix is not None:
+        yield from _layer(network.mix)
+    yield from _layer(Layer(network.shapes, wearer.template.reshape(-1)), even=True)
+
+
+def _bounds(bounds: Bounds, size: int) -> Iterator[np.ndarray]:
+    for row in bounds:
+        yield np.broadcast_to(np.asarray(row, np.float32), size)
+
+
+def _layer(layer: Layer, even: bool = False) -> Iterator[np.ndarray]:
+    kernel = np.zeros((0, len(layer.bias))) if layer.kernel is None else layer.kernel
+    eight, gain, scale = eight_bits(kernel, even)
+    yield np.array([len(kernel), len(layer.bias)], np.int32)
+    yield gain
+    yield np.asarray(layer.bias, np.float32)
+    yield scale
+    yield np.pad(eight, [(0, 0), (0, -len(kernel) % ALIGN)])
+
+
+def eight_bits(kernel: Array, even: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A kernel [inputs, outputs] as a matrix [outputs, inputs] int8, gains [inputs] and scales [outputs]: it is
+    scales * matrix * gains.
+
+    Args:
+        even: whether columns that are finer than others get a gain, for their eight bits.
+    """
+    rows = np.asarray(kernel, np.float64).T
+    gain = np.abs(rows).max(axis=0, initial=0.0) if even else np.ones(rows.shape[1])
+    gain[gain == 0] = 1.0
+    rows = rows / gain
+    scale = np.abs(rows).max(axis=1, initial=0.0) / 127.0
+    scale[scale == 0] = 1.0
+    return np.rint(rows / scale[:, None]).astype(np.int8), gain.astype(np.float32), scale.astype(np.float32)
+
+
+def compiler() -> str | None:
+    """This machine's C compiler."""
+    return next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+
+
+def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
+    """`psi.c` as a shared library in a folder, by this machine's C compiler.
+
+    Raises:
+        OSError: if there is no compiler, or it fails.
+    """
+    program = compiler()
+    if program is None:
+        raise OSError("no C compiler (cc, gcc or clang) on the path")
+    library = Path(directory) / "libpsi.so"
+    command = [program, *flags, "-fPIC", "-shared", "-o", str(library), str(SOURCES[1]), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
+    return library
+
+
+class Psi:
+    """A file in `psi.c`, with one character.
+
+    Args:
+        library: as `build` makes it.
+        rotations, translation: [J, 3, 3] and [3] m, the pose in which the character has been standing.
+
+    Raises:
+        ValueError: if the file is not a whole one, or the pose has another number of joints.
+    """
+
+    def __init__(self, library: str | Path, path: str | Path, rotations: Array, translation: Array):
+        self._model = self._state = None
+        self._c = ctypes.CDLL(str(library))
+        for name in ("psi_load", "psi_begin"):
+            getattr(self._c, name).restype = ctypes.c_void_p
+        why = ctypes.c_char_p()
+        self._model = ctypes.c_void_p(self._c.psi_load(str(path).encode(), ctypes.byref(why)))
+        if not self._model:
+            raise ValueError(f"{path}: {why.value.decode()}")
+        self.joints = self._c.psi_joints(self._model)
+        self.vertices = np.zeros((self._c.psi_vertices(self._model), 3), np.float32)
+        pose = self._pose(rotations, translation)
+        self._state = ctypes.c_void_p(self._c.psi_begin(self._model, *map(_pointer, pose)))
+
+    def step(self, rotations: Array, translation: Array, vertices: bool = True) -> bool:
+        """The next frame, into `vertices` [V, 3] m if asked for; `State.ok` of it."""
+        pose = self._pose(rotations, translation)
+        shown = _pointer(self.vertices) if vertices else None
+        return bool(self._c.psi_step(self._model, self._state, *map(_pointer, pose), shown))
+
+    def _pose(self, rotations: Array, translation: Array) -> tuple[np.ndarray, np.ndarray]:
+        pose = (np.ascontiguousarray(rotations, np.float32), np.ascontiguousarray(translation, np.float32))
+        if pose[0].shape != (self.joints, 3, 3) or pose[1].shape != (3,):
+            raise ValueError(f"poses are [{self.joints}, 3, 3] and [3], not {pose[0].shape} and {pose[1].shape}")
+        return pose
+
+    def __del__(self):
+        if self._state:
+            self._c.psi_end(self._state)
+        if self._model:
+            self._c.psi_free(self._model)
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+def run_c(library: str | Path, path: str | Path, motion: Motion) -> np.ndarray:
+    """Vertices [T, V, 3] m of a file over a motion."""
+    psi = Psi(library, path, motion.rotations[0], motion.translation[0])
+    vertices = []
+    for pose in zip(motion.rotations, motion.translation):
+        psi.step(*pose)
+        vertices.append(psi.vertices.copy())
+    return np.stack(vertices)

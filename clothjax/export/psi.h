@@ -1,0 +1,42 @@
+/* Psi in plain C: one frame of a garment, from the pose of its wearer to its vertices.
+ *
+ * `python -m experiments.convert RUN --to c` writes a GARMENT.psi, this file and psi.c. C99 and nothing else; made with
+ *
+ *     cc -O3 -march=native -c psi.c
+ *
+ * a compiler turns the loops into the dot products of bytes that a processor has. Rotations are 3 x 3 matrices, row
+ * by row, local to the parent joint, the identity in the body's canonical pose; the translation is that of the root
+ * from its canonical place. All lengths are metres, up is +Y. The JSON beside a GARMENT.psi names the joints.
+ */
+#ifndef PSI_H
+#define PSI_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef struct psi_model psi_model; /* a garment on a wearer: only read, by as many threads as there are */
+typedef struct psi_state psi_state; /* of one character: what goes on from frame to frame, and room to compute */
+
+/* NULL where the file cannot be read, and then what is wrong with it in `error`, unless that is NULL. */
+psi_model *psi_load(const char *path, const char **error);
+void psi_free(psi_model *model);
+
+int psi_joints(const psi_model *model);
+int psi_vertices(const psi_model *model);
+float psi_fps(const psi_model *model);
+
+/* The state of a character that has been standing in a pose, rotations [joints][9], translation [3]; NULL without
+ * memory. */
+psi_state *psi_begin(const psi_model *model, const float *rotations, const float *translation);
+void psi_end(psi_state *state);
+
+/* The next frame: vertices [vertices][3] in the world, or NULL for a garment that nobody sees. It takes no memory.
+ * 0 where the pose, the wearer or the code was out of the range of training and was brought into it. */
+int psi_step(const psi_model *model, psi_state *state, const float *rotations, const float *translation,
+             float *vertices);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,194 @@
+"""Psi in plain C is Psi, whatever its input, and no file harms it."""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_export import apart
+from test_export import model as shipped
+from test_export import motion as dance
+
+import clothjax as cj
+from clothjax import folding, inference
+from clothjax.export import native
+from clothjax.types import Pose
+from experiments import convert
+
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
+PLAY = Path(convert.__file__).parent / "deploy" / "play.c"
+SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+model, motion = shipped, dance
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return native.build(tmp_path_factory.mktemp("psi"), (*native.FLAGS, "-Wall", "-Wextra", "-Werror"))
+
+
+def rounded(model):
+    """The model with the matrices that a .psi has."""
+    network = model.network
+
+    def eight(kernel, even=False):
+        matrix, gain, scale = native.eight_bits(kernel, even)
+        return jnp.asarray((scale[:, None] * matrix * gain).T)
+
+    def layer(it, even=False):
+        return it if it is None or it.kernel is None else it._replace(kernel=eight(it.kernel, even))
+
+    return dataclasses.replace(
+        model,
+        network=network._replace(
+            pose=eight(network.pose, True),
+            code=layer(network.code),
+            hidden=tuple(map(layer, network.hidden)),
+            read=layer(network.read, True),
+            decoder=tuple(map(layer, network.decoder)),
+            mix=layer(network.mix),
+            shapes=eight(network.shapes, True),
+        ),
+    )
+
+
+def test_c_is_the_model_of_eight_bits_in_closed_loop(library, model, motion, tmp_path):
+    few = folding.specialise(model, blendshapes=100, max_influences=3)
+    for each in (model, folding.specialise(model), few):
+        found = native.run_c(library, native.to_c(each, tmp_path / "g.psi"), motion)
+        assert apart(found, rounded(each), motion).max() < 3e-5
+        error = apart(found, each, motion)
+        assert 1e-6 < error.mean() < 3e-4 and error.max() < 2e-3
+
+
+def test_c_of_a_folded_code_and_of_a_relu(library, motion, tmp_path):
+    from test_folding import wide
+
+    plain = wide.__wrapped__()
+    for each in (plain, folding.specialise(plain), folding.specialise(plain, blendshapes=5)):
+        found = native.run_c(library, native.to_c(each, tmp_path / "g.psi"), motion)
+        assert apart(found, rounded(each), motion).max() < 1e-4
+    assert each.network.code.kernel is None and each.network.mix is not None
+
+
+def test_c_takes_wild_input_as_the_model_does(library, model, motion, tmp_path):
+    rotations, translation = np.array(motion.rotations[:14], np.float32), np.array(motion.translation[:14])
+    rotations[4, 3, 1, 1] = np.nan
+    translation[7] = np.inf
+    rotations[9] = 0.0  # no rotation at all, but finite
+    translation[11] = 1e20
+    stranger = dataclasses.replace(model, wearer=model.wearer._replace(known=jnp.asarray(False)))
+    for each, first in ((model, 0), (stranger, 0), (model, 4), (model, 7)):
+        path = native.to_c(each, tmp_path / "g.psi")
+        psi = native.Psi(library, path, rotations[first], translation[first])
+        exact = rounded(each)
+        state = inference.initial_state(exact, Pose(rotations[first], translation[first]))
+        told = []
+        for turn, place in zip(rotations[first:], translation[first:]):
+            state, vertices = inference.step(exact, state, Pose(jnp.asarray(turn), jnp.asarray(place)))
+            assert psi.step(turn, place) == bool(state.ok)
+            np.testing.assert_allclose(psi.vertices, vertices, atol=2e-4)
+            told.append(bool(state.ok))
+        assert any(told) == (each is model)
+    with pytest.raises(ValueError, match=r"poses are \[31, 3, 3\] and \[3\], not \(5, 3, 3\)"):
+        psi.step(rotations[0, :5], translation[0])
+
+
+def test_a_garment_that_nobody_sees_goes_on(library, model, motion, tmp_path):
+    path = native.to_c(model, tmp_path / "g.psi")
+    seen, unseen = (native.Psi(library, path, motion.rotations[0], motion.translation[0]) for _ in range(2))
+    for t in range(20):
+        seen.step(motion.rotations[t], motion.translation[t])
+        unseen.step(motion.rotations[t], motion.translation[t], vertices=t == 19)
+    np.testing.assert_array_equal(seen.vertices, unseen.vertices)
+
+
+def made(folder, *flags):
+    """The example program."""
+    program = folder / "play"
+    sources = (PLAY, native.SOURCES[1])
+    command = [native.compiler(), *flags, f"-I{native.SOURCES[0].parent}", *sources, "-lm", "-o", program]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode and "-fsanitize=address,undefined" in flags:
+        pytest.skip(f"no sanitizers here: {done.stderr[:200]}")
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def frames(motion, path, count):
+    rows = [np.asarray(x[:count], np.float32).reshape(count, -1) for x in (motion.rotations, motion.translation)]
+    np.concatenate(rows, axis=1).tofile(path)
+    return path
+
+
+def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(convert, "FRAMES", 20)
+    out = tmp_path / "engine" / "skirt.psi"
+    convert.main(["--pretrained", "skirt", "--to", "c", "--out", str(out)])
+    assert "over 20 frames of closed loop" in capsys.readouterr().out
+    shutil.copy(PLAY, out.parent)
+    program = out.parent / "play"
+    command = [
+        native.compiler(),
+        "-std=c99",
+        "-pedantic-errors",
+        *native.FLAGS,
+        "play.c",
+        "psi.c",
+        "-lm",
+        "-o",
+        program,
+    ]
+    subprocess.run(command, check=True, cwd=out.parent)
+    given = frames(motion, tmp_path / "motion.bin", 30)
+    done = subprocess.run([program, out, given, tmp_path / "vertices.bin"], check=True, capture_output=True, text=True)
+    assert done.stdout.endswith("us a frame, one thread\n")
+    found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(30, -1, 3)
+    skirt = rounded(folding.specialise(cj.load("skirt")))
+    short = motion._replace(rotations=motion.rotations[:30], translation=motion.translation[:30])
+    assert apart(found, skirt, short).max() < 3e-5
+    for broken, why in ((given, "not a .psi of this version"), (tmp_path / "none.psi", "cannot be opened")):
+        done = subprocess.run([program, broken, given, tmp_path / "v.bin"], capture_output=True, text=True)
+        assert done.returncode == 1 and str(broken) in done.stderr and why in done.stderr
+
+
+def hurt(data, structure, rng):
+    """A file damaged somewhere, mostly where its sizes are."""
+    kind = rng.integers(4)
+    if kind == 0:
+        return data[: rng.integers(len(data))]
+    if kind == 1:
+        return data + bytes(int(rng.integers(1, 200)))
+    damaged = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.choice(structure) if kind == 2 else rng.integers(len(data)))
+        damaged[at] = rng.integers(256)
+    return bytes(damaged)
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(5000, marks=pytest.mark.slow)])
+def test_a_damaged_file_is_refused_or_plays_on(count, motion, tmp_path):
+    from test_folding import wide
+
+    program = made(tmp_path, *SANITIZERS)
+    data = native.to_c(wide.__wrapped__(), tmp_path / "g.psi").read_bytes()
+    words = np.frombuffer(data, np.int32)
+    structure = 4 * np.flatnonzero((words != 0) & (np.abs(words) < 1 << 20))  # sizes and indices
+    structure = np.concatenate([structure[structure < 1024], structure])
+    given, rng = frames(motion, tmp_path / "motion.bin", 5), np.random.default_rng(count)
+    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1"}
+    refused = 0
+    for _ in range(count):
+        (tmp_path / "hurt.psi").write_bytes(hurt(data, structure, rng))
+        done = subprocess.run(
+            [program, tmp_path / "hurt.psi", given, tmp_path / "v.bin"],
+            capture_output=True, text=True, timeout=20, env=environment,
+        )  # fmt: skip
+        assert done.returncode in (0, 1) and "runtime error" not in done.stderr, done.stderr
+        assert done.returncode == 0 or "hurt.psi: " in done.stderr
+        refused += done.returncode
+    assert 0.3 * count < refused < count
