@@ -8,6 +8,7 @@
     onnx          ONNX Runtime 1.15 and newer, and engines built on it; for eight bits, --int8; to skin the garment in
                   the engine, --output canonical; for a garment that nobody sees, --output none
     stablehlo     any process with jax or XLA, on CPU, GPU or TPU, without clothjax
+    litert        LiteRT (TensorFlow Lite), as on phones; for eight bits, --int8
     c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
     safetensors   the arrays alone, for whoever builds a runtime
 
@@ -24,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from clothjax import experiment, folding, inference, storage, trained
-from clothjax.export import native, onnx, safetensors, stablehlo
+from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.inference import Model
 from clothjax.types import Material, Motion
 from experiments.session import fail_clearly, setup
@@ -36,7 +37,7 @@ def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run", type=Path, nargs="?", help="folder of a finished run")
     parser.add_argument("--pretrained", choices=trained.shipped())
-    parser.add_argument("--to", choices=["onnx", "stablehlo", "c", "safetensors"], default="onnx")
+    parser.add_argument("--to", choices=["onnx", "stablehlo", "litert", "c", "safetensors"], default="onnx")
     parser.add_argument("--out", type=Path, default=None, help="default: GARMENT.onnx and so on, in the run's folder")
     parser.add_argument("--int8", action="store_true")
     parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
@@ -48,8 +49,10 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     if (arguments.run is None) == (arguments.pretrained is None):
         raise ValueError("give the folder of a run, or --pretrained with the name of a garment")
-    if arguments.to != "onnx" and (arguments.int8 or arguments.batch != 1 or arguments.output != "world"):
-        raise ValueError(f"--int8, --batch and --output are of ONNX, not of {arguments.to}")
+    if arguments.to != "onnx" and (arguments.batch != 1 or arguments.output != "world"):
+        raise ValueError(f"--batch and --output are of ONNX, not of {arguments.to}")
+    if arguments.to not in ("onnx", "litert") and arguments.int8:
+        raise ValueError(f"--int8 is of ONNX and LiteRT, not of {arguments.to}")
     run = arguments.run or trained.folder(arguments.pretrained)
     betas = None
     if arguments.betas is not None:
@@ -57,7 +60,7 @@ def main(argv: list[str]) -> None:
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
     material = None if arguments.material is None else Material(*arguments.material)
     model = inference.load(run, betas=betas, material=material)
-    suffix = "psi" if arguments.to == "c" else arguments.to
+    suffix = {"c": "psi", "litert": "tflite"}.get(arguments.to, arguments.to)
     out = arguments.out or (arguments.run or Path(".")) / f"{model.config.garment}.{suffix}"
     convert(model, out, arguments)
 
@@ -79,6 +82,9 @@ def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
     elif arguments.to == "stablehlo":
         stablehlo.to_stablehlo(small, out, about)
         found = stablehlo.run_stablehlo(out, small, motion)
+    elif arguments.to == "litert":
+        litert.to_litert(small, out, int8=arguments.int8, about=about)
+        found = litert.run_litert(out, small, motion)
     elif arguments.to == "c":
         native.to_c(small, out, about)
         found = _in_c(out, motion)

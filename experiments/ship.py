@@ -1,6 +1,7 @@
 """Packs a finished run as a garment that comes with the library, with what was measured of it.
 
     python -m experiments.ship runs/skirt skirt
+    python -m experiments.ship runs/refined_skirt skirt      # what experiments.refine has made of it
 
 It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
 the validation motions, with the command that trained it and its hours.
@@ -8,6 +9,7 @@ the validation motions, with the command that trained it and its hours.
 
 import argparse
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -23,17 +25,23 @@ def main(argv: list[str]) -> None:
     parser.add_argument("name", help="of the garment")
     arguments = parser.parse_args(argv)
     folder = trained.MODELS / arguments.name
-    size = trained.pack(arguments.run, folder)
-    print(f"{folder}: {size / 1e6:.2f} MB of weights")
+    hours = 0.0
+    if trained.packed(arguments.run):
+        hours = json.loads((folder / "report.json").read_text())["hours"]
+        for name in (trained.WEIGHTS, trained.CONFIG):
+            shutil.copyfile(arguments.run / name, folder / name)
+    else:
+        size = trained.pack(arguments.run, folder)
+        print(f"{folder}: {size / 1e6:.2f} MB of weights")
     report = pretrained({arguments.name: folder})[arguments.name]
     config, _ = trained.phi(folder)
     seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
     seconds += sum(add_seconds(arguments.run).values())
     about = {
-        # the configuration is whole: it trains the same again
+        # the configuration is whole: it trains the same again, a refinement with the rest
         "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
         "seed": config.stage1.seed,
-        "hours": seconds / 3600,
+        "hours": hours + seconds / 3600,
     }
     (folder / "report.json").write_text(json.dumps(about | report, indent=1) + "\n")
     print(table(report))

@@ -11,6 +11,7 @@ from toy import small
 
 from clothjax import configuration
 from clothjax.config import Config
+from clothjax.export import native
 from experiments import benchmark
 from experiments.benchmarks import inference, ncs, scaling, scenes, stage1, timing
 
@@ -66,6 +67,11 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
     assert figures["jax_fold_ratio"] == pytest.approx(us["jax: folded"] / us["jax: plain"])
     assert all(figures[name] > 0 for name in ("network_over_ncs_int8", "offscreen_ratio", "crowd_ratio"))
     assert figures["export_error_mm"]["onnx"] < 0.1 and figures["export_error_mm"]["stablehlo"] < 0.1
+    rest = figures["resting"]
+    assert 20 < rest["frames_taken"] <= rest["frames"] == 40 and rest["error_mm_max"] < 1.0
+    if native.compiler():
+        assert variants["C: folded"]["error_mm"] < variants["folded, int8"]["error_mm"]
+        assert variants["C: folded"]["us"] < variants["jax: folded"]["us"]
 
 
 def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):

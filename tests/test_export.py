@@ -15,7 +15,7 @@ from toy import small
 
 import clothjax as cj
 from clothjax import folding, inference, skinning, storage
-from clothjax.export import onnx, safetensors, stablehlo
+from clothjax.export import litert, onnx, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.types import Motion, Pose
 from experiments import convert
@@ -200,6 +200,23 @@ def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
         assert apart(found, model, motion).max() < most
 
 
+@pytest.mark.slow
+def test_litert_agrees_over_300_frames(model, tmp_path):
+    """In an environment of its own, as its module says: TensorFlow wants older packages."""
+    venv.create(tmp_path / "tf", with_pip=True)
+    python = tmp_path / "tf" / "bin" / "python"
+    root = Path(convert.__file__).parents[1]
+    packages = (f"{root}[export]", "tensorflow-cpu", "ai-edge-litert")
+    subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
+    for int8, most in (((), 0.1), (("--int8",), 20.0)):
+        out = tmp_path / "t.tflite"
+        command = [python, "-m", "experiments.convert", "--pretrained", "tshirt", "--to", "litert", "--out", out, *int8]
+        subprocess.run(command, check=True, cwd=root)
+        told = json.loads(out.with_suffix(".json").read_text())
+        assert told["distance_to_jax"]["frames"] == 300 and 0 < told["distance_to_jax"]["max_mm"] < most
+        assert told["results"][-1] == "vertices" and told["arguments"]["translation"] == [3]
+
+
 def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
     path = stablehlo.to_stablehlo(model, tmp_path / "g.stablehlo")
     assert apart(stablehlo.run_stablehlo(path, model, motion), model, motion).max() < 2e-5
@@ -222,8 +239,10 @@ def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
     told = json.loads(out.with_suffix(".json").read_text())
     assert told["betas"] == [1.0] and 0 < told["distance_to_jax"]["mean_mm"] < 1
     assert "over 40 frames of closed loop" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="are of ONNX, not of stablehlo"):
+    with pytest.raises(ValueError, match="is of ONNX and LiteRT, not of stablehlo"):
         convert.main(["--pretrained", "skirt", "--to", "stablehlo", "--int8"])
+    with pytest.raises(ValueError, match="are of ONNX, not of c"):
+        convert.main(["--pretrained", "skirt", "--to", "c", "--batch", "3"])
     with pytest.raises(ValueError, match="give the folder of a run, or --pretrained"):
         convert.main([])
 
@@ -236,3 +255,6 @@ def test_what_is_not_installed_is_said(model, monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(ImportError, match=r"pip install clothjax\[export\]"):
             write(model, tmp_path / f"g.{ending}")
+    monkeypatch.setitem(sys.modules, "tensorflow", None)
+    with pytest.raises(ImportError, match="pip install tensorflow-cpu ai-edge-litert"):
+        litert.to_litert(model, tmp_path / "g.tflite")

@@ -7,7 +7,7 @@ output) has a scale of its own; its inputs `psi.c` quantises to sixteen bits, af
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -154,9 +154,14 @@ class Psi:
 
     def step(self, rotations: Array, translation: Array, vertices: bool = True) -> bool:
         """The next frame, into `vertices` [V, 3] m if asked for; `State.ok` of it."""
+        return bool(self.bound(rotations, translation, vertices)())
+
+    def bound(self, rotations: Array, translation: Array, vertices: bool = True) -> Callable[[], int]:
+        """A call that takes the next frame, of the pose that is then in these arrays if they are float32."""
         pose = self._pose(rotations, translation)
         shown = _pointer(self.vertices) if vertices else None
-        return bool(self._c.psi_step(self._model, self._state, *map(_pointer, pose), shown))
+        arguments = (self._model, self._state, *map(_pointer, pose), shown)
+        return lambda: self._c.psi_step(*arguments)
 
     def _pose(self, rotations: Array, translation: Array) -> tuple[np.ndarray, np.ndarray]:
         pose = (np.ascontiguousarray(rotations, np.float32), np.ascontiguousarray(translation, np.float32))

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import inference
-from clothjax.export import sidecar
-from clothjax.inference import Model, State
+from clothjax.export import frame, sidecar
+from clothjax.inference import Model
 from clothjax.types import Motion, Pose
 
 RUN = """
@@ -36,30 +36,14 @@ def to_stablehlo(model: Model, path: str | Path, about: dict | None = None) -> P
 
     It takes the state (`latent` [C], `previous_rotations` [2, J, 3, 3], `previous_positions` [2, J, 3] m,
     `previous_translations` [2, 3] m) and the pose to come (`rotations` [J, 3, 3] local, `translation` [3] m), and
-    gives the next state in that order, `ok`, and the vertices [V, 3] m in the world. It runs on CPUs, GPUs and TPUs.
+    gives the next state in that order, `ok`, and the vertices [V, 3] m in the world (`frame.ARGUMENTS` and
+    `frame.RESULTS`). It runs on CPUs, GPUs and TPUs.
     """
     path = Path(path)
-
-    def frame(latent, rotations, positions, translations, pose_rotations, pose_translation):
-        state = State(latent, rotations, positions, translations, jnp.asarray(True))
-        following, vertices = inference.step(model, state, Pose(pose_rotations, pose_translation))
-        return *following, vertices
-
-    joints = len(model.parents)
-    shapes = (model.network.first.shape, (2, joints, 3, 3), (2, joints, 3), (2, 3), (joints, 3, 3), (3,))
-    arguments = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    exported = jax.export.export(jax.jit(frame), platforms=("cpu", "cuda", "tpu"))(*arguments)
+    arguments = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in frame.shapes(model).values()]
+    exported = jax.export.export(jax.jit(frame.function(model)), platforms=("cpu", "cuda", "tpu"))(*arguments)
     path.write_bytes(exported.serialize())
-    names = ("latent", "previous_rotations", "previous_positions", "previous_translations", "rotations", "translation")
-    told = {
-        "arguments": {name: list(shape) for name, shape in zip(names, shapes)},
-        "results": ["latent", "rotations", "positions", "translations", "ok", "vertices"],
-        "state": "feed the first four results back; of previous_*, entry 0 is the newest frame",
-        "first_state": "latent is first_latent. Run once with the first pose, which is also both entries of "
-        "previous_rotations and previous_translations; entry 0 of the positions that come back, twice, is "
-        "previous_positions",
-    }
-    sidecar.write(model, path, "world", told | (about or {}))
+    sidecar.write(model, path, "world", frame.told(model) | (about or {}))
     return path
 
 
