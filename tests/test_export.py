@@ -15,7 +15,7 @@ from toy import small
 
 import clothjax as cj
 from clothjax import folding, inference, skinning, storage
-from clothjax.export import litert, onnx, safetensors, stablehlo
+from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.types import Motion, Pose
 from experiments import convert
@@ -198,6 +198,38 @@ def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
         assert "ms a frame, one thread of WebAssembly" in done.stdout
         found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(300, -1, 3)
         assert apart(found, model, motion).max() < most
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    native.compiler() is None or shutil.which("go") is None,
+    reason="needs a C compiler, and Go to fetch ONNX Runtime's header",
+)
+def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
+    import onnxruntime
+
+    module = "github.com/yalue/onnxruntime_go@v1.27.0"  # brings the header; the library is that of the Python package
+    got = subprocess.run(["go", "mod", "download", "-json", module], check=True, capture_output=True, text=True)
+    (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
+    (tmp_path / "libonnxruntime.so.1").symlink_to(library)
+    source = Path(convert.__file__).parent / "deploy" / "play_onnx.c"
+    command = [native.compiler(), "-std=c99", "-O2", "-Wall", "-Werror", "-isystem", json.loads(got.stdout)["Dir"]]
+    program = tmp_path / "play_onnx"
+    command += [source, tmp_path / "libonnxruntime.so.1", f"-Wl,-rpath,{tmp_path}", "-o", program]
+    subprocess.run(command, check=True)
+    motion = convert.validation(model)
+    rows = [np.asarray(x, np.float32).reshape(300, -1) for x in (motion.rotations, motion.translation)]
+    np.concatenate(rows, axis=1).tofile(tmp_path / "motion.bin")
+    for int8, most in ((False, 1e-4), (True, 4e-3)):
+        onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
+        command = [program, tmp_path / "g.onnx", tmp_path / "motion.bin", tmp_path / "vertices.bin"]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        assert done.stdout.endswith("us a frame, one thread\n")
+        found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(300, -1, 3)
+        assert apart(found, model, motion).max() < most
+    (tmp_path / "g.json").unlink()
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and "g.json: cannot be opened" in done.stderr
 
 
 @pytest.mark.slow

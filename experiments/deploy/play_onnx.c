@@ -1,0 +1,148 @@
+/* A garment in ONNX Runtime, as an engine in C or C++ drives it: one call a frame, tensors in buffers of its own.
+ *
+ *     cc -O2 -I HEADERS play_onnx.c -L LIBRARIES -lonnxruntime -o play_onnx
+ *     ./play_onnx tshirt.onnx motion.bin vertices.bin
+ *
+ * Beside tshirt.onnx lies tshirt.json, which experiments.convert wrote. motion.bin has for every frame the rotations
+ * [joints][9] and the translation [3] as float32. Vertices [frames][vertices][3] are written as float32; the median time
+ * of a frame on one thread is printed.
+ */
+#define _POSIX_C_SOURCE 199309L
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "onnxruntime_c_api.h"
+
+enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS };
+enum { NEXT_LATENT, NEXT_HISTORY, OK, VERTICES, OUTPUTS };
+static const char *const inputs[INPUTS] = {"latent", "history", "rotations", "translation"};
+static const char *const outputs[OUTPUTS] = {"next_latent", "next_history", "ok", "vertices"};
+
+static const OrtApi *ort;
+
+static void fail(const char *what, const char *why) {
+    fprintf(stderr, "%s: %s\n", what, why);
+    exit(1);
+}
+
+static void check(OrtStatus *status) {
+    if (status) fail("ONNX Runtime", ort->GetErrorMessage(status));
+}
+
+typedef struct {
+    OrtValue *value;
+    void *data;
+    size_t bytes;
+} tensor;
+
+static tensor make(const OrtTypeInfo *type, const OrtMemoryInfo *memory) {
+    const OrtTensorTypeAndShapeInfo *info;
+    ONNXTensorElementDataType kind;
+    int64_t shape[8];
+    size_t rank, count;
+    tensor t;
+    check(ort->CastTypeInfoToTensorInfo(type, &info));
+    check(ort->GetTensorElementType(info, &kind));
+    check(ort->GetDimensionsCount(info, &rank));
+    check(ort->GetDimensions(info, shape, rank));
+    check(ort->GetTensorShapeElementCount(info, &count));
+    t.bytes = count * (kind == ONNX_TENSOR_ELEMENT_DATA_TYPE_BOOL ? sizeof(bool) : sizeof(float));
+    t.data = calloc(1, t.bytes);
+    check(ort->CreateTensorWithDataAsOrtValue(memory, t.data, t.bytes, shape, rank, kind, &t.value));
+    return t;
+}
+
+/* The numbers of an array in a JSON file. */
+static void read_array(const char *path, const char *name, float *to, size_t count) {
+    FILE *file = fopen(path, "rb");
+    if (!file || fseek(file, 0, SEEK_END)) fail(path, "cannot be opened: it lies beside the .onnx");
+    const long size = ftell(file);
+    char *text = calloc(1, (size_t)size + 1);
+    rewind(file);
+    if (fread(text, 1, (size_t)size, file) != (size_t)size) fail(path, "cannot be read");
+    fclose(file);
+    char *at = strstr(text, name);
+    at = at ? strchr(at, '[') : NULL;
+    for (size_t i = 0; i < count; i++) {
+        char *end = at;
+        if (at) to[i] = strtof(at + 1, &end);
+        if (!at || end == at + 1) fail(path, "has no whole first_latent");
+        at = end;
+    }
+    free(text);
+}
+
+static double microseconds(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return 1e6 * now.tv_sec + 1e-3 * now.tv_nsec;
+}
+
+static int order(const void *a, const void *b) {
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+int main(int count, char **arguments) {
+    if (count != 4) fail(arguments[0], "GARMENT.onnx motion.bin vertices.bin");
+    OrtEnv *env;
+    OrtSessionOptions *options;
+    OrtSession *session;
+    OrtMemoryInfo *memory;
+    ort = OrtGetApiBase()->GetApi(ORT_API_VERSION);
+    if (!ort) fail("ONNX Runtime", "the library is older than its header");
+    check(ort->CreateEnv(ORT_LOGGING_LEVEL_WARNING, "psi", &env));
+    check(ort->CreateSessionOptions(&options));
+    check(ort->SetIntraOpNumThreads(options, 1));
+    check(ort->CreateSession(env, arguments[1], options, &session));
+    check(ort->CreateCpuMemoryInfo(OrtDeviceAllocator, OrtMemTypeDefault, &memory));
+
+    tensor in[INPUTS], out[OUTPUTS];
+    for (int i = 0; i < INPUTS; i++) {
+        OrtTypeInfo *type;
+        check(ort->SessionGetInputTypeInfo(session, i, &type));
+        in[i] = make(type, memory);
+    }
+    for (int i = 0; i < OUTPUTS; i++) {
+        OrtTypeInfo *type;
+        check(ort->SessionGetOutputTypeInfo(session, i, &type));
+        out[i] = make(type, memory);
+    }
+    const OrtValue *given[INPUTS] = {in[0].value, in[1].value, in[2].value, in[3].value};
+    OrtValue *found[OUTPUTS] = {out[0].value, out[1].value, out[2].value, out[3].value};
+
+    char *about = malloc(strlen(arguments[1]) + 6), *dot;
+    strcpy(about, arguments[1]);
+    dot = strrchr(about, '.');
+    strcpy(dot ? dot : about + strlen(about), ".json");
+    FILE *motion = fopen(arguments[2], "rb"), *shown = fopen(arguments[3], "wb");
+    if (!motion || !shown) fail(motion ? arguments[3] : arguments[2], "cannot be opened");
+
+    double *taken = NULL;
+    size_t frames = 0;
+    while (fread(in[ROTATIONS].data, in[ROTATIONS].bytes, 1, motion) == 1 &&
+           fread(in[TRANSLATION].data, in[TRANSLATION].bytes, 1, motion) == 1) {
+        if (!frames) { /* the character has been standing in the first pose: "first_state" in the JSON */
+            const size_t half = in[HISTORY].bytes / 2;
+            read_array(about, "\"first_latent\"", in[LATENT].data, in[LATENT].bytes / sizeof(float));
+            check(ort->Run(session, NULL, inputs, given, INPUTS, outputs, OUTPUTS, found));
+            memcpy(in[HISTORY].data, out[NEXT_HISTORY].data, half);
+            memcpy((char *)in[HISTORY].data + half, out[NEXT_HISTORY].data, half);
+        }
+        const double began = microseconds();
+        check(ort->Run(session, NULL, inputs, given, INPUTS, outputs, OUTPUTS, found));
+        memcpy(in[LATENT].data, out[NEXT_LATENT].data, in[LATENT].bytes);
+        memcpy(in[HISTORY].data, out[NEXT_HISTORY].data, in[HISTORY].bytes);
+        taken = realloc(taken, (frames + 1) * sizeof *taken);
+        taken[frames++] = microseconds() - began;
+        if (fwrite(out[VERTICES].data, out[VERTICES].bytes, 1, shown) != 1) fail(arguments[3], "cannot be written");
+    }
+    if (!frames) fail(arguments[2], "has no whole frame");
+    qsort(taken, frames, sizeof *taken, order);
+    printf("%.1f us a frame, one thread\n", taken[frames / 2]);
+    if (fclose(shown)) fail(arguments[3], "cannot be written");
+    return 0;
+}
