@@ -9,10 +9,13 @@ PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
-.PHONY: quickstart test test-slow lint
+.PHONY: quickstart demo test test-slow lint
 
 quickstart: $(INSTALLED)  ## train both stages on the embedded body, evaluate, render, export
 	@$(PYTHON) -m experiments.quickstart
+
+demo: $(INSTALLED)  ## a character that you steer, live in the browser
+	@$(PYTHON) -m experiments.demo
 
 test: $(INSTALLED)  ## the tests of every day
 	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile
@@ -40,6 +43,6 @@ $(INSTALLED): pyproject.toml uv.lock
 	        echo "no Python 3.11 or newer with its venv module (tried: $(CANDIDATES))" >&2
 	        exit 1
 	    fi
-	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,export,render,sweep]'
+	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,demo,export,render,sweep]'
 	fi
 	touch $@
