@@ -160,6 +160,13 @@ def scaled(value: Array, limits) -> Array:
     return (value - limits.low) / (limits.high - limits.low)
 
 
+def unscaled(share: Array, limits) -> Array:
+    """The inverse of `scaled`."""
+    if limits.log:
+        return limits.low * (limits.high / limits.low) ** share
+    return limits.low + share * (limits.high - limits.low)
+
+
 def _canonical(
     character: Character, state: ClothState, window: Window, contact: Contact | None, held: Array, force: Array
 ):

@@ -5,7 +5,7 @@ than the present one fits better, the character goes on from there, and what the
 2018). Clips need not turn: the character is steered besides.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,9 +24,10 @@ LEAST = 0.1  # m, m/s: the deviation of features that hardly differ
 EVERY = 6  # frames from search to search
 WORTH = 1.0  # of the squared distance of features, that another frame must save
 SETTLE = 0.25  # s, in which the player's wish is half come true
-BLEND = 0.12  # s, in which half of a jump is gone
-STEER = np.radians(110.0)  # rad/s at the most
-FASTEST = 1.5  # times as fast as it does in the clips a joint may turn
+BLEND = 0.12  # s, half-life of the springs that take away what jumps
+STEER = np.radians(110.0)  # rad/s at the most, besides what clips turn
+FASTEST = 1.5  # times as fast as it does in the clips a joint may turn ...
+STILL = 1.0  # rad/s, ... or as fast as this if it hardly does
 
 
 class Library(NamedTuple):
@@ -34,7 +35,8 @@ class Library(NamedTuple):
     heading."""
 
     rotations: np.ndarray  # [N, J, 3, 3] local; the root's without the heading
-    root: np.ndarray  # [N, 3] m, of the hips
+    root: np.ndarray  # [N, 3] m, place of the root joint
+    origin: np.ndarray  # [3] m, that in the canonical pose
     velocity: np.ndarray  # [N, 2] m/s, of the character: sideways, ahead
     turn: np.ndarray  # [N] rad/s
     features: np.ndarray  # [N, F] weighted, in standard deviations
@@ -63,6 +65,8 @@ def library(clips: Mapping[str, Motion], joints: np.ndarray, parents: Sequence[i
     if len(feet) < 2:
         raise ValueError(f"no feet among the joints {', '.join(names)}: their names have `foot` or `ankle` in them")
     fps = next(iter(clips.values())).fps
+    joints, parents = np.asarray(joints), np.array(parents)
+    positions = jax.jit(jax.vmap(lambda turn: skinning.forward_kinematics(turn, joints, parents)[1]))
     families = tuple(dict.fromkeys(_family(name) for name in clips))
     parts: list[dict[str, np.ndarray]] = []
     for name, clip in clips.items():
@@ -70,7 +74,7 @@ def library(clips: Mapping[str, Motion], joints: np.ndarray, parents: Sequence[i
             raise ValueError(
                 f"{name} has {len(clip.rotations)} frames at {clip.fps} a second; a second at {fps} is least"
             )
-        parts.append(_frames(clip, joints, np.array(parents), feet))
+        parts.append(_frames(clip, positions, feet))
         parts[-1]["family"] = np.full(len(clip.rotations), families.index(_family(name)))
     whole = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     blocks = [whole[name].reshape(len(whole["turn"]), -1) for name in WEIGHTS]
@@ -84,6 +88,7 @@ def library(clips: Mapping[str, Motion], joints: np.ndarray, parents: Sequence[i
     return Library(
         rotations=whole["rotations"],
         root=whole["root"],
+        origin=joints[0],
         velocity=whole["velocity"],
         turn=whole["turn"],
         features=(features - mean) * scale,
@@ -92,7 +97,7 @@ def library(clips: Mapping[str, Motion], joints: np.ndarray, parents: Sequence[i
         family=whole["family"],
         left=whole["left"],
         families=families,
-        fastest=np.max([part["speed"].max(axis=0) for part in parts], axis=0),
+        fastest=np.maximum(np.max([part["speed"].max(axis=0) for part in parts], axis=0), STILL / FASTEST),
         fps=float(fps),
     )
 
@@ -101,14 +106,17 @@ def _family(name: str) -> str:
     return name.rstrip("0123456789").rstrip("_")
 
 
-def _frames(clip: Motion, joints: np.ndarray, parents: np.ndarray, feet: list[int]) -> dict[str, np.ndarray]:
-    """What `Library` has of the frames of one clip, and its features by kind."""
+def _frames(clip: Motion, positions: Callable, feet: list[int]) -> dict[str, np.ndarray]:
+    """What `Library` has of the frames of one clip, and its features by kind.
+
+    Args:
+        positions: of the joints [T, J, 3] m, of their rotations.
+    """
     fps, count = clip.fps, len(clip.rotations)
     rotations, translation = (np.asarray(x, np.float64) for x in (clip.rotations, clip.translation))
-    kinematics = jax.jit(jax.vmap(lambda turn: skinning.forward_kinematics(turn, joints, parents)))
-    places = np.asarray(kinematics(rotations.astype(np.float32))[1]) + translation[:, None]
+    places = np.asarray(positions(rotations.astype(np.float32))) + translation[:, None]
     window = min(int(SMOOTH * fps) | 1, count - 1 | 1)
-    way = savgol_filter(translation[:, [0, 2]] + joints[0, [0, 2]], window, 2, axis=0)
+    way = savgol_filter(places[:, 0, [0, 2]], window, 2, axis=0)
     root = rotations[:, 0]
     facing = np.unwrap(np.arctan2(root[:, 0, 2] - root[:, 2, 0], root[:, 0, 0] + root[:, 2, 2]))
     facing = savgol_filter(facing, window, 2)
@@ -134,7 +142,7 @@ def _frames(clip: Motion, joints: np.ndarray, parents: np.ndarray, feet: list[in
     faced[:, 0] = Rotation.from_rotvec(np.stack([0 * facing, -facing, 0 * facing], axis=1)).as_matrix() @ root
     return {
         "rotations": faced,
-        "root": relative[:, 0] - joints[0],
+        "root": relative[:, 0],
         "velocity": own(velocity),
         "turn": turn,
         "left": np.arange(count)[::-1].copy(),
@@ -181,14 +189,15 @@ class Player:
         self._joints, self._joint_speed = np.zeros((2, *clips.rotations.shape[1:-1]))
         self._root, self._root_speed = np.zeros((2, 3))
         self._since = self._now = 0
-        self._now, _ = self._search(self._query(None, np.zeros(2)), self._allowed(None))
+        self._now, _ = self._search(self._query(None, np.zeros(2), 0.0), self._allowed(None))
         self._shown = clips.rotations[self._now]
 
-    def step(self, velocity: np.ndarray, family: str | None = None) -> Pose:
+    def step(self, velocity: np.ndarray, facing: float | None = None, family: str | None = None) -> Pose:
         """The pose of the next frame.
 
         Args:
             velocity: [2] m/s in the world, x and z, that the player wishes.
+            facing: rad from +z to +x, the heading that the player wishes; default that of the velocity, or none.
             family: of the clips, if it is to do that and nothing else, as "jump".
 
         Raises:
@@ -196,16 +205,19 @@ class Player:
         """
         clips, dt = self.clips, 1.0 / self.clips.fps
         velocity = np.asarray(velocity, np.float64)
+        if facing is None:
+            facing = np.arctan2(*velocity) if np.linalg.norm(velocity) > 0.1 else self.heading
+        off = (facing - self.heading + np.pi) % (2 * np.pi) - np.pi
         allowed = self._allowed(family)
         self._since += 1
         ended = clips.left[self._now] == 0
         if ended or not allowed[self._now] or self._since >= EVERY:
-            found, gain = self._search(self._query(self._now, velocity), allowed)
+            found, gain = self._search(self._query(self._now, velocity, off), allowed)
             if ended or not allowed[self._now] or gain > WORTH:
-                self._move_to(found)
+                self._transition(found)
             self._since = 0
         self._now += clips.left[self._now] > 0
-        self._advance(velocity, dt)
+        self._advance(velocity, off, dt)
         pose = _by(self._joints, clips.rotations[self._now])
         step = _between(pose, self._shown)
         most = FASTEST * clips.fastest * dt
@@ -216,22 +228,20 @@ class Player:
         rotations[0] = _by(np.array([[0.0, self.heading, 0.0]]), rotations[:1])[0]
         root = clips.root[self._now] + self._root
         where = self.place + _turned(root[[0, 2]], self.heading)
-        return Pose(rotations.astype(np.float32), np.array([where[0], root[1], where[1]], np.float32))
+        translation = np.array([where[0], root[1], where[1]]) - clips.origin
+        return Pose(rotations.astype(np.float32), translation.astype(np.float32))
 
-    def _advance(self, wish: np.ndarray, dt: float) -> None:
+    def _advance(self, wish: np.ndarray, off: float, dt: float) -> None:
         """Place, heading, and what is left of the last jump, a frame on."""
         clips = self.clips
         self.velocity += (wish - self.velocity) * (1.0 - 0.5 ** (dt / SETTLE))
         self.place = self.place + dt * _turned(clips.velocity[self._now], self.heading)
-        steer = 0.0
-        if np.linalg.norm(wish) > 0.1:
-            off = np.arctan2(wish[0], wish[1]) - self.heading
-            steer = np.clip((off + np.pi) % (2 * np.pi) - np.pi, -STEER * SETTLE, STEER * SETTLE) / SETTLE
+        steer = np.clip(np.log(2.0) / SETTLE * off, -STEER, STEER)
         self.heading += dt * (clips.turn[self._now] + steer)
         self._joints, self._joint_speed = _decayed(self._joints, self._joint_speed, dt)
         self._root, self._root_speed = _decayed(self._root, self._root_speed, dt)
 
-    def _move_to(self, found: int) -> None:
+    def _transition(self, found: int) -> None:
         """Goes on from another frame: what differs is kept, with its velocity, and then decays."""
         clips, now = self.clips, self._now
         fps = clips.fps
@@ -251,12 +261,10 @@ class Player:
         numbers = [self.clips.families.index(name) for name in chosen]
         return np.isin(self.clips.family, numbers)
 
-    def _query(self, now: int | None, wish: np.ndarray) -> np.ndarray:
-        """The features of what the character does, and is to do."""
+    def _query(self, now: int | None, wish: np.ndarray, off: float) -> np.ndarray:
+        """The features of what the character does, and is to do: go like that, and turn by `off` rad."""
         clips = self.clips
         query = np.zeros(clips.features.shape[1]) if now is None else clips.features[now] / clips.scale + clips.mean
-        wanted = np.arctan2(wish[0], wish[1]) if np.linalg.norm(wish) > 0.1 else self.heading
-        off = (wanted - self.heading + np.pi) % (2 * np.pi) - np.pi
         path, facing = [], []
         for seconds in AHEAD:
             rest = 0.5 ** (seconds / SETTLE)

@@ -4,190 +4,194 @@
     python -m experiments.demo --garment dress --port 8080
     python -m experiments.demo --run runs/my_skirt --motions clips/*.motion.h5
 
-Arrow keys: up walks, then runs; down slows; left and right turn; space jumps. The panel has the same, the garment, body
-and cloth, and what stands beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
+Arrow keys: up walks, then runs; down slows; left and right turn; space jumps, if there is a clip called jump. The panel
+has the same, the garment, body and cloth, and what stands beside Psi: plain skinning, its teacher Phi, and the solver,
+for which all others then wait.
 """
 
 import argparse
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
-from threading import Event
 
 import numpy as np
 
 from clothjax import motion_matching, storage, trained
-from clothjax.config import Range
-from clothjax.features import scaled
-from clothjax.types import Material
-from experiments.live import STAGES, TURN, Show, strain
+from clothjax.features import scaled, unscaled
+from clothjax.types import Material, Motion
+from experiments.live import STAGES, TURN, Show, finer, strain
 from experiments.session import fail_clearly, setup
 
 CLIPS = tuple(f"{family}_{i}" for family in ("walk", "run", "arms", "jump", "twist", "dance") for i in range(4))
-WANDER = ("walk", "run", "arms")
-ACTION = 1.2  # s, of a jump that was asked for by a key
+WANDER = ("walk", "run", "arms")  # families that are for going about; others are done when they are asked for
+ACTION = 36  # frames, of what was asked for
 BETAS = 4  # sliders
-FLAG = 2.0  # m, between the heavy lines of the floor
-
-
-class Viewer:
-    """A `Show` in a browser (viser), with its panel."""
-
-    def __init__(self, show: Show, garments: dict[str, str | Path], garment: str, host: str, port: int):
-        import viser
-
-        self.show, self.garments = show, garments
-        self.server = server = viser.ViserServer(host, port, label="clothjax", verbose=False)
-        self.stop, self.single = Event(), Event()
-        server.scene.set_up_direction("+y")
-        self.floor = server.scene.add_grid(
-            "/floor", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=FLAG, infinite_grid=True
-        )
-        server.initial_camera.position, server.initial_camera.look_at = (1.5, 1.5, 2.7), (0.0, 0.9, 0.0)
-        self.meshes: dict = {}
-        self.stale = False
-        gui, steering = server.gui, show.steering
-
-        def button(label: str, act, hotkey: str | None = None, hint: str | None = None) -> None:
-            gui.add_button(label, hint=hint).on_click(lambda _: act())
-            if hotkey:
-                gui.add_command(label, hotkey=hotkey).on_trigger(lambda _: act())
-
-        with gui.add_folder("Steer"):
-            button("Faster", steering.faster, "arrowup", "arrow up")
-            button("Slower", steering.slower, "arrowdown", "arrow down")
-            button("Left", lambda: steering.turn(TURN), "arrowleft", "arrow left")
-            button("Right", lambda: steering.turn(-TURN), "arrowright", "arrow right")
-            self.actions = [name for name in show.clips.families if name not in show.player.wander]
-            for name in self.actions:
-                button(name.capitalize(), lambda name=name: self._do(name), "space" if name == "jump" else None)
-        with gui.add_folder("Garment"):
-            self.garment = gui.add_dropdown("Garment", tuple(garments), initial_value=garment)
-            self.detail = gui.add_dropdown("Vertices", ("1 000", "4 000"))
-            self.count = gui.add_slider("Characters", 1, 100, 1, 1)
-            self.betas = [gui.add_slider(f"Body {i + 1}", -3.0, 3.0, 0.1, 0.0) for i in range(BETAS)]
-            cloth = show.wardrobe.model.config.material
-            self.ranges = {name: getattr(cloth, f"{name}_range") for name in Material._fields}
-            self.material = {
-                name: gui.add_slider(
-                    name.capitalize(), 0.0, 1.0, 0.01, round(float(scaled(getattr(cloth, name), between)), 2)
-                )
-                for name, between in self.ranges.items()
-            }
-        with gui.add_folder("Show"):
-            self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
-            self.body = gui.add_checkbox("Body", True)
-            self.wireframe = gui.add_checkbox("Wireframe", False)
-            self.strain = gui.add_checkbox("Strain", False, hint="points: blue at rest, red from 20 %")
-            self.follow = gui.add_checkbox("Follow", True)
-            self.pause = gui.add_checkbox("Pause", False)
-            button("Single step", self.single.set)
-        self.text = gui.add_markdown("")
-        for control in (self.garment, self.detail, self.count, *self.betas, *self.material.values()):
-            control.on_update(lambda _: setattr(self, "stale", True))
-        self.wireframe.on_update(lambda _: self._clear())
-
-    def _do(self, family: str) -> None:
-        self.show.steering.do(family, self.show.frames / self.show.clips.fps + ACTION)
-
-    def _clear(self) -> None:
-        for mesh in self.meshes.values():
-            mesh.remove()
-        self.meshes.clear()
-
-    def _dress(self) -> None:
-        self.stale = False
-        betas = np.zeros(10)
-        betas[:BETAS] = [slider.value for slider in self.betas]
-        material = Material(*(_within(self.ranges[name], slider.value) for name, slider in self.material.items()))
-        fine = self.detail.value != "1 000"
-        self.show.dress(self.garments[self.garment.value], betas, material, int(self.count.value), fine)
-        self._clear()
-
-    def run(self, frames: int | None = None) -> None:
-        """Shows frame after frame, at the clips' rate where it can."""
-        done, due, shown_at = 0, time.perf_counter(), deque(maxlen=60)
-        while not self.stop.is_set() and (frames is None or done < frames):
-            if self.stale:
-                self._dress()
-            if self.pause.value and not self.single.is_set():
-                time.sleep(0.02)
-                due = time.perf_counter()
-                continue
-            self.single.clear()
-            self.show.stages = tuple(name for name in STAGES if self.stages[name].value)
-            garments, bodies = self.show.frame()
-            began = time.perf_counter()
-            self._draw(garments, bodies)
-            done += 1
-            shown_at.append(time.perf_counter())
-            if done % 15 == 0:
-                rate = (len(shown_at) - 1) / max(shown_at[-1] - shown_at[0], 1e-9)
-                milliseconds = {name: 1e3 * seconds for name, seconds in self.show.seconds.items()}
-                self.text.content = (
-                    f"Psi {milliseconds['garment']:.2f} ms a frame; pose and body {milliseconds['rest']:.2f} ms; "
-                    f"sending {1e3 * (shown_at[-1] - began):.2f} ms; {rate:.0f} frames a second"
-                )
-            due = max(due + 1.0 / self.show.clips.fps, time.perf_counter() - 0.1)
-            time.sleep(max(0.0, due - time.perf_counter()))
-
-    def _draw(self, garments: dict[str, np.ndarray], bodies: list[np.ndarray]) -> None:
-        wardrobe = self.show.wardrobe
-        here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
-        with self.server.atomic():
-            self.floor.position = tuple(-(here % FLAG))
-            kept = set()
-            for stage, crowd in garments.items():
-                faces = wardrobe.faces if stage == "psi" else wardrobe.other_faces
-                for i, vertices in enumerate(crowd):
-                    kept.add(name := f"/{stage}/{i}")
-                    self._mesh(name, vertices - here, faces, COLOURS[stage])
-                    if self.strain.value and i == 0:
-                        kept.add(name := f"/{stage}/strain")
-                        self._strain(name, vertices - here, faces)
-            for i, vertices in enumerate(bodies if self.body.value else []):
-                kept.add(name := f"/body/{i}")
-                self._mesh(name, vertices - here, self.show.body_faces, COLOURS["body"])
-            for name in set(self.meshes) - kept:
-                self.meshes.pop(name).remove()
-
-    def _mesh(self, name: str, vertices: np.ndarray, faces: np.ndarray, colour: tuple[int, int, int]) -> None:
-        vertices = vertices.astype(np.float32)
-        if name in self.meshes:
-            self.meshes[name].vertices = vertices
-            return
-        body = name.startswith("/body")
-        self.meshes[name] = self.server.scene.add_mesh_simple(
-            name, vertices, faces, color=colour, side="double", wireframe=self.wireframe.value and not body
-        )
-
-    def _strain(self, name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
-        sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        edges = np.unique(np.sort(sides, axis=1), axis=0)
-        template = np.asarray(self.show.wardrobe.model.wearer.template).T
-        rest = np.linalg.norm(template[edges[:, 0]] - template[edges[:, 1]], axis=1)
-        share = np.clip(strain(vertices, edges, rest) / 0.2, 0.0, 1.0)[:, None]
-        colours = (255 * (share * [0.9, 0.1, 0.1] + (1 - share) * [0.1, 0.3, 0.9])).astype(np.uint8)
-        self.meshes[name] = self.server.scene.add_point_cloud(name, vertices, colours, point_size=0.008)
-
-
+GRID = 2.0  # m, between the heavy lines of the floor
+STRAINED = 0.2  # that is drawn red
 COLOURS = {
     "body": (214, 178, 152), "psi": (58, 107, 184), "skinning": (150, 150, 150), "phi": (88, 150, 96),
     "solver": (196, 120, 60),
 }  # fmt: skip
 
 
+class Viewer:
+    """A `Show` in a browser (viser), with its panel.
+
+    The panel's callbacks run in other threads: they only leave word, and `run` acts on it.
+
+    Args:
+        garments: folders of runs or packed models, by name.
+    """
+
+    def __init__(self, show: Show, garments: dict[str, Path], garment: str, host: str, port: int):
+        import viser
+
+        self.show, self.garments = show, garments
+        self.meshes: dict = {}
+        self._shown: tuple | None = None
+        self._dress_anew = self._draw_anew = self._one_more = False
+        self.server = server = viser.ViserServer(host, port, label="clothjax", verbose=False)
+        server.scene.set_up_direction("+y")
+        self.floor = server.scene.add_grid(
+            "/floor", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=GRID, infinite_grid=True
+        )
+        server.initial_camera.position, server.initial_camera.look_at = (1.5, 1.5, 2.7), (0.0, 0.9, 0.0)
+        gui, steering = server.gui, show.steering
+        with gui.add_folder("Steer"):
+            self._button("Faster", steering.faster, "arrowup", "arrow up")
+            self._button("Slower", steering.slower, "arrowdown", "arrow down")
+            self._button("Left", lambda: steering.turn(TURN), "arrowleft", "arrow left")
+            self._button("Right", lambda: steering.turn(-TURN), "arrowright", "arrow right")
+            for name in show.player.clips.families:
+                if name not in show.player.wander:
+                    key = "space" if name == "jump" else None
+                    self._button(name.capitalize(), lambda name=name: steering.do(name, show.frames + ACTION), key, key)
+        with gui.add_folder("Garment"):
+            self.garment = gui.add_dropdown("Garment", tuple(garments), initial_value=garment)
+            config = show.outfit.model.config
+            self.fine = gui.add_checkbox("4 000 vertices", False, visible=finer(config) is not None)
+            self.count = gui.add_slider("Characters", 1, 100, 1, 1)
+            self.betas = [gui.add_slider(f"Body {i + 1}", -3.0, 3.0, 0.1, 0.0) for i in range(BETAS)]
+            self.ranges = {name: getattr(config.material, f"{name}_range") for name in Material._fields}
+            given = {name: float(scaled(getattr(config.material, name), self.ranges[name])) for name in self.ranges}
+            self.material = {
+                name: gui.add_slider(name.capitalize(), 0.0, 1.0, 0.01, round(share, 2))
+                for name, share in given.items()
+            }
+        with gui.add_folder("Show"):
+            self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
+            self.body = gui.add_checkbox("Body", True)
+            self.wireframe = gui.add_checkbox("Wireframe", False)
+            self.strain = gui.add_checkbox("Strain", False, hint=f"points: blue at rest, red from {STRAINED:.0%}")
+            self.follow = gui.add_checkbox("Follow", True)
+            self.pause = gui.add_checkbox("Pause", False)
+            self._button("Single step", lambda: setattr(self, "_one_more", True))
+        self.text = gui.add_markdown("")
+        for control in (self.garment, self.fine, self.count, *self.betas, *self.material.values()):
+            control.on_update(lambda _: setattr(self, "_dress_anew", True))
+        for control in (self.body, self.wireframe, self.strain, self.follow):
+            control.on_update(lambda _: setattr(self, "_draw_anew", True))
+
+    def _button(self, label: str, act: Callable, hotkey: str | None = None, hint: str | None = None) -> None:
+        self.server.gui.add_button(label, hint=hint).on_click(lambda _: act())
+        if hotkey:
+            self.server.gui.add_command(label, hotkey=hotkey).on_trigger(lambda _: act())
+
+    def run(self, frames: int | None = None) -> None:
+        """Shows frame after frame, at the clips' rate where it can, until so many are done."""
+        done, due, shown_at = 0, time.perf_counter(), deque(maxlen=60)
+        while frames is None or done < frames:
+            if self._dress_anew:
+                self._dress()
+            if self.pause.value and not self._one_more:
+                if self._draw_anew:
+                    self._draw()
+                time.sleep(0.02)
+                due = time.perf_counter()
+                continue
+            self._one_more = False
+            self.show.stages = tuple(name for name in STAGES if self.stages[name].value)
+            self._shown = self.show.frame()
+            began = time.perf_counter()
+            self._draw()
+            done += 1
+            shown_at.append(time.perf_counter())
+            if done % 15 == 0:
+                rate = (len(shown_at) - 1) / (shown_at[-1] - shown_at[0])
+                psi, pose = (1e3 * self.show.seconds[name] for name in ("psi", "pose"))
+                self.text.content = (
+                    f"Psi {psi:.2f} ms a frame; pose and body {pose:.2f} ms; "
+                    f"sending {1e3 * (shown_at[-1] - began):.2f} ms; {rate:.0f} frames a second"
+                )
+            due = max(due + 1.0 / self.show.player.clips.fps, time.perf_counter() - 0.1)
+            time.sleep(max(0.0, due - time.perf_counter()))
+
+    def _dress(self) -> None:
+        """Dresses as the panel says; a paused show goes on by a frame, or nothing of it would be seen."""
+        self._dress_anew, self._draw_anew, self._one_more = False, True, True
+        betas = np.array([slider.value for slider in self.betas])
+        material = Material(*(unscaled(self.material[name].value, self.ranges[name]) for name in Material._fields))
+        run = self.garments[self.garment.value]
+        self.show.dress(run, betas, material, int(self.count.value), self.fine.value)
+
+    def _draw(self) -> None:
+        if self._draw_anew:  # other faces, or another look
+            self._draw_anew = False
+            for mesh in self.meshes.values():
+                mesh.remove()
+            self.meshes.clear()
+        if self._shown is None:
+            return
+        garments, bodies = self._shown
+        here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
+        drawn = set()
+        with self.server.atomic():
+            self.floor.position = tuple(-(here % GRID))
+            for stage, crowd in garments.items():
+                faces, rest = self.show.outfit.mesh(stage)
+                for i, vertices in enumerate(crowd):
+                    drawn.add(self._mesh(f"/{stage}/{i}", vertices - here, faces, COLOURS[stage]))
+                if self.strain.value:
+                    drawn.add(
+                        self._points(f"/{stage}/strain", crowd[0] - here, strain(crowd[0], rest, faces) / STRAINED)
+                    )
+            for i, vertices in enumerate(bodies if self.body.value else []):
+                drawn.add(self._mesh(f"/body/{i}", vertices - here, self.show.body_faces, COLOURS["body"]))
+            for name in set(self.meshes) - drawn:
+                self.meshes.pop(name).remove()
+
+    def _mesh(self, name: str, vertices: np.ndarray, faces: np.ndarray, colour: tuple[int, int, int]) -> str:
+        vertices = vertices.astype(np.float32)
+        if name in self.meshes:
+            self.meshes[name].vertices = vertices
+        else:
+            wires = self.wireframe.value and not name.startswith("/body")
+            self.meshes[name] = self.server.scene.add_mesh_simple(
+                name, vertices, faces, color=colour, side="double", wireframe=wires
+            )
+        return name
+
+    def _points(self, name: str, vertices: np.ndarray, share: np.ndarray) -> str:
+        share = np.clip(share, 0.0, 1.0)[:, None]
+        colours = (255 * (share * [0.9, 0.1, 0.1] + (1 - share) * [0.1, 0.3, 0.9])).astype(np.uint8)
+        vertices = vertices.astype(np.float32)
+        if name in self.meshes:
+            self.meshes[name].points, self.meshes[name].colors = vertices, colours
+        else:
+            self.meshes[name] = self.server.scene.add_point_cloud(name, vertices, colours, point_size=0.008)
+        return name
+
+
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--garment", default="skirt", choices=trained.shipped())
-    parser.add_argument("--run", type=Path, default=None, help="a folder of your own, instead of those of the library")
-    parser.add_argument(
-        "--motions", type=Path, nargs="+", default=None, help="clips to walk by; default: embedded ones"
-    )
+    parser.add_argument("--run", type=Path, help="a run or packed model of yours, instead of those of the library")
+    parser.add_argument("--motions", type=Path, nargs="+", help="clips to go about by; default: the embedded ones")
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=8080)
-    parser.add_argument("--frames", type=int, default=None, help="so many, then stop")
+    parser.add_argument("--frames", type=int, help="so many, then stop")
     arguments = parser.parse_args(argv)
     viewer = start(arguments)
     print(f"open http://{arguments.host}:{viewer.server.get_port()} in a browser; stop with Ctrl-C", flush=True)
@@ -200,31 +204,41 @@ def main(argv: list[str]) -> None:
 
 
 def start(arguments: argparse.Namespace) -> Viewer:
-    """A viewer that waits to be run."""
-    garments: dict[str, str | Path] = {name: name for name in trained.shipped()}
-    garment = arguments.garment
+    """A viewer that waits to be run.
+
+    Raises:
+        ImportError: if viser is not installed.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise ImportError("the demo needs viser: pip install clothjax[demo]") from error
+    garments, garment = {name: trained.folder(name) for name in trained.shipped()}, arguments.garment
     if arguments.run is not None:
-        garment = arguments.run.name
-        garments = {garment: arguments.run}
-    config = trained.psi(trained.folder(garment) if arguments.run is None else arguments.run)[0]
+        garments, garment = {arguments.run.name: arguments.run}, arguments.run.name
+    config = trained.psi(garments[garment])[0]
     body, names = storage.load_body(config.body), storage.joint_names(config.body)
-    if arguments.motions is None:
-        motions, wander = {name: storage.load_motion(name, names) for name in CLIPS}, WANDER
-    else:
-        motions, wander = (
-            {path.name.split(".")[0]: storage.load_motion(path, names) for path in arguments.motions},
-            None,
-        )
-    clips = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
-    show = Show(clips, wander or clips.families, garments[garment])
-    return Viewer(show, garments, garment, arguments.host, arguments.port)
+    motions = clips(arguments.motions, names)
+    found = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
+    wander = tuple(name for name in found.families if name in WANDER) or found.families
+    return Viewer(Show(found, wander, garments[garment]), garments, garment, arguments.host, arguments.port)
 
 
-def _within(between: Range, share: float) -> float:
-    """The inverse of `features.scaled`."""
-    if between.log:
-        return between.low * (between.high / between.low) ** share
-    return between.low + share * (between.high - between.low)
+def clips(paths: list[Path] | None, names: tuple[str, ...]) -> dict[str, Motion]:
+    """Clips by their names; the embedded ones for None.
+
+    Raises:
+        ValueError: if two files have one name.
+    """
+    if paths is None:
+        return {name: storage.load_motion(name, names) for name in CLIPS}
+    found: dict[str, Motion] = {}
+    for path in paths:
+        name = path.name.removesuffix(".h5").removesuffix(".motion")
+        if name in found:
+            raise ValueError(f"{path}: another clip is called {name} too: rename one")
+        found[name] = storage.load_motion(path, names)
+    return found
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""A character that is steered, and its garment by Psi and what it is compared with, frame by frame."""
+"""A character that is steered, and its garment by Psi and what that is compared with, frame by frame."""
 
 import time
 from collections import deque
+from functools import cache, cached_property
 from pathlib import Path
 
 import jax
@@ -9,17 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import character as characters
-from clothjax import (
-    experiment,
-    folding,
-    inference,
-    rollout,
-    simulation,
-    skinning,
-    solver,
-    storage,
-    trained,
-)
+from clothjax import experiment, folding, inference, rollout, simulation, skinning, solver, storage, topology, trained
+from clothjax.config import Config
 from clothjax.motion_matching import Library, Player
 from clothjax.types import Material, Pose
 
@@ -31,98 +23,123 @@ BEHIND = 11  # frames that a character of a crowd is behind the one before it
 BODIES = 4  # that are shown, of a crowd
 
 
-class Wardrobe:
-    """A garment on a wearer, moved by each of the stages that are asked for."""
+class Outfit:
+    """A garment on a wearer, moved by each of the stages.
 
-    def __init__(
-        self, run: str | Path, betas: np.ndarray, material: Material | None, count: int = 1, fine: bool = False
-    ):
+    Args:
+        run: the folder of a run or of a packed model.
+        count: characters that wear it.
+        fine: on the mesh of 4 000 vertices, if there is one.
+    """
+
+    def __init__(self, run: Path, betas: np.ndarray, material: Material | None, count: int = 1, fine: bool = False):
         model = inference.load(run, betas=betas, material=material)
-        if fine:
+        if fine and (garment := finer(model.config)):
             body = storage.load_body(model.config.body)
-            garment = storage.load_garment(model.config.garment.replace("_1000", "_4000"), body)
-            model = folding.on_mesh(model, garment, betas)
-        self.run, self.model, self.betas, self.material = run, model, betas, material
-        self.crowd = inference.crowd([model] * count)
-        self.count = count
-        self.faces = np.asarray(model.faces)
-        self.states = None
-        self._slow: _Teacher | None = None
+            model = folding.on_mesh(model, storage.load_garment(garment, body), betas)
+        self.model, self.count = model, count
+        self._crowd = inference.crowd([model] * count)
+        self._states = None
+        self._run, self._betas, self._material = run, betas, material
+        self._beside: dict[str, tuple] = {}
+
+    @cached_property
+    def _comparison(self) -> "Comparison":
+        return _comparison(self._run)
+
+    @cached_property
+    def _character(self) -> characters.Character:
+        return self._comparison.dress(self._betas, self._material)
+
+    def mesh(self, stage: str) -> tuple[np.ndarray, np.ndarray]:
+        """The faces [F, 3] of what a stage shows, and its vertices [V, 3] m at rest."""
+        if stage == "psi":
+            return np.asarray(self.model.faces), np.asarray(self.model.wearer.template).T
+        return self._comparison.faces, np.asarray(self._character.template)
 
     def psi(self, poses: list[Pose]) -> np.ndarray:
-        """Vertices [N, V, 3] m of the next frame, of as many characters as there are poses."""
-        if self.states is None:
-            states = [inference.initial_state(self.model, pose) for pose in poses]
-            self.states = jax.tree.map(lambda *each: jnp.stack(each), *states)
+        """Vertices [N, V, 3] m of the next frame of the characters, whose poses these are."""
+        if self._states is None:
+            state = inference.initial_state(self.model, poses[0])
+            self._states = jax.tree.map(lambda x: jnp.stack([x] * self.count), state)
         given = Pose(*(np.stack(each) for each in zip(*poses)))
-        self.states, vertices = inference.step_crowd(self.crowd, self.states, given)
+        self._states, vertices = inference.step_crowd(self._crowd, self._states, given)
         return np.asarray(vertices)
 
-    def beside(self, stage: str, window: Pose) -> np.ndarray:
-        """Vertices [1, V, 3] m of the next frame of the first character, by another stage.
+    def beside(self, stages: list[str], window: Pose) -> dict[str, np.ndarray]:
+        """Vertices [V, 3] m of the next frame of the first character, by other stages.
 
         Args:
+            stages: one that was left out for a frame begins anew, on the skinned garment.
             window: its last three poses.
         """
-        if self._slow is None:
-            self._slow = _Teacher(self.run, self.betas, self.material)
-        return self._slow.step(stage, window)[None]
-
-    @property
-    def other_faces(self) -> np.ndarray:
-        """Of what the other stages show."""
-        return self._slow.faces
+        self._beside = {
+            stage: self._comparison.step(stage, self._character, self._beside.get(stage), window) for stage in stages
+        }
+        return {stage: vertices for stage, (_, vertices) in self._beside.items()}
 
 
-class _Teacher:
-    """Skinning, Phi and the solver, frame by frame; on the mesh that Phi was trained on."""
+def finer(config: Config) -> str | None:
+    """The garment of a configuration on 4 000 vertices, if that is there."""
+    name = config.garment.replace("_1000", "_4000")
+    return name if name != config.garment and storage.asset(name).is_file() else None
 
-    def __init__(self, run: str | Path, betas: np.ndarray, material: Material | None):
-        folder = trained.folder(run) if run in trained.shipped() else Path(run)
-        self.config, phi = trained.phi(folder)
-        whole = experiment.assemble(self.config)
-        cloth = experiment.material(self.config) if material is None else material
-        self.scene, config = whole.scene, self.config
-        self.character = characters.dress(self.scene, jnp.asarray(betas), cloth, config.physics)
+
+@cache
+def _comparison(run: Path) -> "Comparison":
+    return Comparison(run)
+
+
+class Comparison:
+    """What Psi is compared with, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
+
+    def __init__(self, run: Path):
+        self.config, model = trained.phi(run)
+        self.scene, config = experiment.assemble(self.config).scene, self.config
         self.faces = np.asarray(self.scene.mesh.faces)
-        self.states: dict = {}
-        animate = rollout.phi(jax.tree.map(jnp.asarray, phi), self.scene, self.character, config)
+        model = jax.tree.map(jnp.asarray, model)
 
-        @jax.jit
-        def settle(poses):
-            return rollout.settle(animate, self.scene, self.character, poses, config)
+        def phi(character):
+            return rollout.phi(model, self.scene, character, config)
 
-        @jax.jit
-        def take(state, poses):
-            taken, (new, _, _) = rollout.take(
-                animate, self.scene, self.character, state, poses, 1.0 / config.fps, config
-            )
+        def take(character, state, poses):
+            dt = 1.0 / config.fps
+            taken, (new, _, _) = rollout.take(phi(character), self.scene, character, state, poses, dt, config)
             return rollout.follow(taken, poses.translation[2]), new
 
-        @jax.jit
-        def skinned(poses):
-            return characters.skinned(self.character, characters.window(self.scene, self.character, poses).following)
+        def skinned(character, poses):
+            return characters.skinned(character, characters.window(self.scene, character, poses).following)
 
-        self._settle, self._take, self._skinned = settle, take, skinned
+        self._settle = jax.jit(lambda character, p: rollout.settle(phi(character), self.scene, character, p, config))
+        self._take, self._skinned = jax.jit(take), jax.jit(skinned)
         self._problem = simulation.problem(self.scene, config)
 
-    def step(self, stage: str, window: Pose) -> np.ndarray:
-        """Vertices [V, 3] m in the world after the newest of three poses."""
+    def dress(self, betas: np.ndarray, material: Material | None) -> characters.Character:
+        """A wearer; the material defaults to the configured one."""
+        material = experiment.material(self.config) if material is None else material
+        material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
+        return characters.dress(self.scene, jnp.asarray(betas, jnp.float32), material, self.config.physics)
+
+    def step(self, stage: str, character, before: tuple | None, window: Pose) -> tuple[tuple, np.ndarray]:
+        """What a stage goes on from in the frame after the next, and the vertices [V, 3] m of the next, in the world.
+
+        Args:
+            before: what it goes on from; None to begin.
+            window: the last three poses.
+        """
         here = window.translation[1]
         poses = Pose(jnp.asarray(window.rotations), jnp.asarray(window.translation - here[None]))
+        state = None if before is None else before[0]
         if stage == "skinning":
-            return np.asarray(self._skinned(poses)) + here
+            return None, np.asarray(self._skinned(character, poses)) + here
         if stage == "phi":
-            state = self.states.get(stage)
-            state, new = self._take(self._settle(poses) if state is None else state, poses)
-            self.states[stage] = state
-            return np.asarray(new) + here
-        before, now = self.states.get(stage) or [np.asarray(self._settle(poses).position)] * 2
-        step, _, held, advance = self._problem(self.character, before, now, poses)
+            state, new = self._take(character, self._settle(character, poses) if state is None else state, poses)
+            return state, np.asarray(new) + here
+        last, now = [np.asarray(self._settle(character, poses).position)] * 2 if state is None else state
+        step, _, held, advance = self._problem(character, last, now, poses)
         new, _ = solver.solve_step(held, step, self.scene.mesh, self.scene.garment.pinned, self.config.physics)
         new = np.asarray(new, np.float32)
-        self.states[stage] = (now, new - np.asarray(advance)[None])
-        return new + here
+        return (now, new - np.asarray(advance)[None]), new + here
 
 
 class Steering:
@@ -130,7 +147,8 @@ class Steering:
 
     def __init__(self):
         self.gait, self.heading = 0, 0.0
-        self.doing, self.until = None, 0.0  # a family of clips, and the time it ends
+        self.doing: str | None = None  # a family of clips ...
+        self.until = 0  # ... up to this frame
 
     def faster(self) -> None:
         self.gait = min(self.gait + 1, len(SPEEDS) - 1)
@@ -141,7 +159,7 @@ class Steering:
     def turn(self, by: float) -> None:
         self.heading += by
 
-    def do(self, family: str, until: float) -> None:
+    def do(self, family: str, until: int) -> None:
         self.doing, self.until = family, until
 
     def velocity(self) -> np.ndarray:
@@ -150,66 +168,90 @@ class Steering:
 
 
 class Show:
-    """A player's character and its garments, frame by frame, whatever shows them."""
+    """A player's character and its garment, frame by frame, whatever shows them.
 
-    def __init__(self, clips: Library, wander: tuple[str, ...], run: str | Path):
-        self.clips, self.steering = clips, Steering()
-        self.player = Player(clips, wander)
+    Raises:
+        ValueError: if the clips and the garment are not of as many frames a second.
+    """
+
+    def __init__(self, clips: Library, wander: tuple[str, ...], run: Path):
+        self.steering, self.player = Steering(), Player(clips, wander)
         self.stages: tuple[str, ...] = ("psi",)
-        self.past: deque[Pose] = deque(maxlen=1)
-        self.seconds = {"garment": 0.0, "rest": 0.0}
+        self.past: deque[Pose] = deque()
+        self.seconds = {"psi": 0.0, "pose": 0.0}
         self.frames = 0
-        self.dress(run, np.zeros(10))
+        self.dress(run)
 
-    def dress(self, run, betas, material: Material | None = None, count: int = 1, fine: bool = False) -> None:
-        """Another garment, wearer or number of characters."""
-        self.wardrobe = Wardrobe(run, betas, material, count, fine)
-        body = storage.load_body(self.wardrobe.model.config.body)
-        vertices = skinning.shaped_vertices(body, jnp.asarray(betas))
-        joints = skinning.shaped_joints(body, jnp.asarray(betas))
+    def dress(
+        self,
+        run: Path,
+        betas: np.ndarray | None = None,
+        material: Material | None = None,
+        count: int = 1,
+        fine: bool = False,
+    ) -> None:
+        """Another garment, wearer or number of characters; `betas` may be some of those that the body has."""
+        config = trained.psi(run)[0]
+        if config.fps != self.player.clips.fps:
+            raise ValueError(f"the clips are at {self.player.clips.fps} frames a second, {run} at {config.fps}")
+        self._pose_body, body = _body(config.body)
+        whole = np.zeros(body.shapedirs.shape[-1])
+        if betas is not None:
+            whole[: len(betas)] = betas[: len(whole)]
+        self.outfit = Outfit(run, whole, material, count, fine)
+        self._shape = [
+            shaped(body, jnp.asarray(whole)) for shaped in (skinning.shaped_vertices, skinning.shaped_joints)
+        ]
         self.body_faces = np.asarray(body.faces)
-        self._body = jax.jit(lambda pose: skinning.pose_body(body, vertices, joints, pose))
         self.past = deque(self.past, maxlen=max(3, BEHIND * (count - 1) + 1))
 
     def frame(self) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
         """The next: vertices [N, V, 3] m by stage, in their places, and those [B, 3] of bodies."""
         began = time.perf_counter()
-        family = self.steering.doing if self.frames < self.steering.until * self.clips.fps else None
-        pose = self.player.step(self.steering.velocity(), family)
+        steering = self.steering
+        family = steering.doing if self.frames < steering.until else None
+        pose = self.player.step(steering.velocity(), steering.heading, family)
         self.past.append(pose)
         self.frames += 1
-        poses = [self.past[max(len(self.past) - 1 - BEHIND * i, 0)] for i in range(self.wardrobe.count)]
-        shift = [_place(i, pose) for i, pose in enumerate(poses)]
-        bodies = [np.asarray(self._body(pose)) + place for pose, place in zip(poses[:BODIES], shift)]
-        rest = time.perf_counter() - began
-        began = time.perf_counter()
-        shown = {"psi": self.wardrobe.psi(poses) + np.stack(shift)[:, None]}
-        self.seconds = {"garment": time.perf_counter() - began, "rest": rest}
+        poses = [self.past[max(len(self.past) - 1 - BEHIND * i, 0)] for i in range(self.outfit.count)]
+        shift = np.stack([_place(i, each, pose) for i, each in enumerate(poses)])
+        bodies = [np.asarray(self._pose_body(*self._shape, each)) + by for each, by in zip(poses[:BODIES], shift)]
+        paused = time.perf_counter()
+        shown = {"psi": self.outfit.psi(poses) + shift[:, None]}
+        self.seconds = {"psi": time.perf_counter() - paused, "pose": paused - began}
         newest = [self.past[max(len(self.past) - 3 + i, 0)] for i in range(3)]
         window = Pose(*(np.stack(each) for each in zip(*newest)))
-        if "psi" not in self.stages:
-            del shown["psi"]
-        for i, stage in enumerate(name for name in self.stages if name != "psi"):
-            beside = np.array([APART * (i + 1), 0.0, 0.0], np.float32)
-            shown[stage] = self.wardrobe.beside(stage, window) + beside
-            bodies.append(np.asarray(self._body(pose)) + beside)
-        return shown, bodies
+        others = [stage for stage in self.stages if stage != "psi"]
+        for i, (stage, vertices) in enumerate(self.outfit.beside(others, window).items()):
+            aside = np.array([APART * (i + 1), 0.0, 0.0], np.float32)
+            shown[stage] = (vertices + aside)[None]
+            bodies.append(np.asarray(self._pose_body(*self._shape, pose)) + aside)
+        return {stage: shown[stage] for stage in self.stages}, bodies
 
 
-def _place(number: int, pose: Pose) -> np.ndarray:
-    """What a character of a crowd is moved by [3] m: they stand in rows behind the first, wherever they have been."""
+@cache
+def _body(name: str):
+    """A body, and a function that poses one of such vertices and joints."""
+    body = storage.load_body(name)
+    return jax.jit(lambda vertices, joints, pose: skinning.pose_body(body, vertices, joints, pose)), body
+
+
+def _place(number: int, pose: Pose, first: Pose) -> np.ndarray:
+    """What a character of a crowd is moved by [3] m: it stands in its row behind the first."""
     row = int(np.sqrt(number))
-    return np.array([APART * (number - row * row - row), 0.0, -APART * row], np.float32)
+    there = np.array([APART * (number - row * row - row), 0.0, -APART * row])
+    return (there + (first.translation - pose.translation) * [1, 0, 1]).astype(np.float32)
 
 
-def strain(vertices: np.ndarray, edges: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def strain(vertices: np.ndarray, rest: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The largest |l / l_0 - 1| of the edges at each vertex [V].
 
     Args:
-        edges: [E, 2]; rest: [E] m.
+        rest: [V, 3] m, where they have their lengths l_0.
     """
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    edges = topology.edges(faces)
+    length, original = (np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (vertices, rest))
     most = np.zeros(len(vertices))
     for end in edges.T:
-        np.maximum.at(most, end, np.abs(length / rest - 1.0))
+        np.maximum.at(most, end, np.abs(length / original - 1.0))
     return most

@@ -16,6 +16,7 @@ from pathlib import Path
 from clothjax import trained
 from clothjax.run_folder import add_seconds, read_seconds
 from experiments.evaluate import pretrained, table
+from experiments.refine import REFINED
 from experiments.session import fail_clearly, setup
 
 
@@ -27,7 +28,7 @@ def main(argv: list[str]) -> None:
     folder = trained.MODELS / arguments.name
     hours = 0.0
     if trained.packed(arguments.run):
-        hours = json.loads((folder / "report.json").read_text())["hours"]
+        hours = json.loads((arguments.run / REFINED).read_text())["hours"]
         for name in (trained.WEIGHTS, trained.CONFIG):
             shutil.copyfile(arguments.run / name, folder / name)
     else:
@@ -38,7 +39,7 @@ def main(argv: list[str]) -> None:
     seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
     seconds += sum(add_seconds(arguments.run).values())
     about = {
-        # the configuration is whole: it trains the same again, a refinement with the rest
+        # the configuration is whole: it trains the same again, but that a refinement then begins at unrounded weights
         "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
         "seed": config.stage1.seed,
         "hours": hours + seconds / 3600,

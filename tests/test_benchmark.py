@@ -68,10 +68,9 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
     assert all(figures[name] > 0 for name in ("network_over_ncs_int8", "offscreen_ratio", "crowd_ratio"))
     assert figures["export_error_mm"]["onnx"] < 0.1 and figures["export_error_mm"]["stablehlo"] < 0.1
     rest = figures["resting"]
-    assert 20 < rest["frames_taken"] <= rest["frames"] == 40 and rest["error_mm_max"] < 1.0
+    assert rest["frames_moving"] < rest["frames_taken"] < rest["frames"] and 0 < rest["error_mm_max"] < 1.0
     if native.compiler():
         assert variants["C: folded"]["error_mm"] < variants["folded, int8"]["error_mm"]
-        assert variants["C: folded"]["us"] < variants["jax: folded"]["us"]
 
 
 def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):

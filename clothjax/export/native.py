@@ -1,7 +1,8 @@
 """Plain C: the matrices of a model in eight bits for `psi.c`, which needs no runtime.
 
 A `.psi` is little-endian; every array in it begins at a multiple of 64 bytes. Of a matrix each row (what gives one
-output) has a scale of its own; its inputs `psi.c` quantises to sixteen bits, after a gain where they differ in scale.
+output) has a scale of its own; its inputs `psi.c` quantises to sixteen bits (up to 512 of them; fewer bits for more),
+after a gain where they differ in scale.
 """
 
 import ctypes
@@ -151,13 +152,15 @@ class Psi:
         self.vertices = np.zeros((self._c.psi_vertices(self._model), 3), np.float32)
         pose = self._pose(rotations, translation)
         self._state = ctypes.c_void_p(self._c.psi_begin(self._model, *map(_pointer, pose)))
+        if not self._state:
+            raise MemoryError(f"no memory for a character in {path}")
 
     def step(self, rotations: Array, translation: Array, vertices: bool = True) -> bool:
         """The next frame, into `vertices` [V, 3] m if asked for; `State.ok` of it."""
         return bool(self.bound(rotations, translation, vertices)())
 
     def bound(self, rotations: Array, translation: Array, vertices: bool = True) -> Callable[[], int]:
-        """A call that takes the next frame, of the pose that is then in these arrays if they are float32."""
+        """A call that takes the next frame, of what these arrays then hold, if they are contiguous float32."""
         pose = self._pose(rotations, translation)
         shown = _pointer(self.vertices) if vertices else None
         arguments = (self._model, self._state, *map(_pointer, pose), shown)

@@ -30,8 +30,8 @@ struct psi_model {
     void *file;
     int32_t joints, kept, moving, vertices, code, hidden, decoder, skip, relu, mixed, known;
     float fps, decay;
-    const int32_t *parent, *input, *mover;
-    const float *weight, *place, *pose_mean, *start; /* weight [moving][vertices, to a multiple of LANES] */
+    const int32_t *parent, *input, *bone;
+    const float *weight, *rest, *pose_mean, *start; /* weight [moving][vertices, to a multiple of LANES] */
     bounds pose_bounds, code_bounds;
     layer pose, previous, then[MOST_HIDDEN], read, decode[MOST_HIDDEN], mix, shapes;
     int32_t widest, longest;  /* of what layers give and of what they take */
@@ -41,7 +41,7 @@ struct psi_state {
     void *memory;
     float *latent, *next;
     float *rotations, *positions, *translation;  /* [3][joints][9], [3][joints][3], [3][3], newest first */
-    float *turns, *movers;                       /* [joints][9], [moving][12] */
+    float *global, *skinning;                    /* rotations [joints][9]; matrices [moving][12] */
     float *inputs, *rows[3];
     int16_t *fixed; /* inputs of a layer in fixed point */
 };
@@ -144,8 +144,8 @@ static void read_model(reader *r, psi_model *m) {
     m->parent = integers(r, m->joints);
     for (int32_t j = 0; r->sound && j < m->joints; j++) within(r, m->parent[j], j ? 0 : -1, j - 1);
     m->input = indices(r, m->kept, m->joints);
-    m->mover = indices(r, m->moving, m->joints);
-    m->place = floats(r, 3 * (size_t)m->joints);
+    m->bone = indices(r, m->moving, m->joints);
+    m->rest = floats(r, 3 * (size_t)m->joints);
     m->weight = floats(r, (size_t)m->moving * ((m->vertices + LANES - 1) / LANES * LANES));
     int32_t poses = 6 + 18 * m->kept + 9 * (m->kept - 1);
     m->pose_mean = floats(r, poses);
@@ -219,7 +219,7 @@ static float largest(const float *x, const float *gain, int32_t count) {
     return value;
 }
 
-/* A dense layer, its inputs in fixed point of sixteen bits, its sums exact. */
+/* A dense layer; its inputs in fixed point, of sixteen bits or as many as their sums have room for, which are exact. */
 static void dense(const layer *l, const float *x, float *restrict y, psi_state *s) {
     const float limit = largest(x, l->gain, l->inputs);
     const int32_t stride = l->stride;
@@ -241,12 +241,12 @@ static void dense(const layer *l, const float *x, float *restrict y, psi_state *
     }
 }
 
-static void rectify(float *x, int32_t count) {
+static void relu(float *x, int32_t count) {
     for (int32_t i = 0; i < count; i++) x[i] = x[i] > 0.0f ? x[i] : 0.0f;
 }
 
 /* Into the range, NaN to its middle; whether it was there but for the slack. */
-static int bring(float *x, const bounds *b, int32_t count) {
+static int clamp(float *x, const bounds *b, int32_t count) {
     int inside = 1;
     for (int32_t i = 0; i < count; i++) {
         float y = x[i] < b->low[i] ? b->low[i] : x[i] > b->high[i] ? b->high[i] : x[i];
@@ -267,15 +267,15 @@ static void turn(const float *a, const float *x, float *y) {
 }
 
 /* Global rotations and positions of the joints, the root at its canonical place. */
-static void kinematics(const psi_model *m, const float *rotations, float *turns, float *positions) {
-    memcpy(turns, rotations, 9 * sizeof(float));
-    memcpy(positions, m->place, 3 * sizeof(float));
+static void kinematics(const psi_model *m, const float *rotations, float *global, float *positions) {
+    memcpy(global, rotations, 9 * sizeof(float));
+    memcpy(positions, m->rest, 3 * sizeof(float));
     for (int32_t j = 1; j < m->joints; j++) {
         const int32_t p = m->parent[j];
         float bone[3];
-        for (int c = 0; c < 3; c++) bone[c] = m->place[3 * j + c] - m->place[3 * p + c];
-        multiply(turns + 9 * p, rotations + 9 * j, turns + 9 * j);
-        turn(turns + 9 * p, bone, positions + 3 * j);
+        for (int c = 0; c < 3; c++) bone[c] = m->rest[3 * j + c] - m->rest[3 * p + c];
+        multiply(global + 9 * p, rotations + 9 * j, global + 9 * j);
+        turn(global + 9 * p, bone, positions + 3 * j);
         for (int c = 0; c < 3; c++) positions[3 * j + c] += positions[3 * p + c];
     }
 }
@@ -323,7 +323,7 @@ static void predict(const psi_model *m, psi_state *s) {
     if (m->previous.inputs) dense(&m->previous, s->latent, y, s);
     for (int32_t i = 0; i < width; i++) x[i] += m->previous.inputs ? y[i] : m->previous.bias[i] + s->latent[i];
     for (int32_t l = 0; l < m->hidden; l++) {
-        rectify(x, m->then[l].inputs);
+        relu(x, m->then[l].inputs);
         dense(&m->then[l], x, y, s);
         float *swap = x;
         x = y, y = swap;
@@ -340,13 +340,13 @@ static const float *decode(const psi_model *m, psi_state *s) {
         for (int32_t i = 0; i < m->read.outputs; i++) read[i] += s->latent[m->code - m->read.outputs + i];
     memcpy(x, read, wide * sizeof(float));
     for (int32_t l = 0; l < m->decoder; l++) {
-        rectify(x, m->decode[l].inputs);
+        relu(x, m->decode[l].inputs);
         dense(&m->decode[l], x, y, s);
         float *swap = x;
         x = y, y = swap;
     }
     for (int32_t i = 0; m->skip && i < last; i++) x[i] += read[wide + i];
-    if (m->relu) rectify(x, last);
+    if (m->relu) relu(x, last);
     if (m->mixed) {
         dense(&m->mix, x, y, s);
         x = y, y = s->rows[2];
@@ -358,11 +358,11 @@ static const float *decode(const psi_model *m, psi_state *s) {
 static void skin(const psi_model *m, psi_state *s, const float *garment, float *vertices) {
     const int32_t count = m->vertices, padded = (count + LANES - 1) / LANES * LANES;
     for (int32_t k = 0; k < m->moving; k++) {
-        const int32_t j = m->mover[k];
-        float *to = s->movers + 12 * k, offset[3];
-        turn(s->turns + 9 * j, m->place + 3 * j, offset);
+        const int32_t j = m->bone[k];
+        float *to = s->skinning + 12 * k, offset[3];
+        turn(s->global + 9 * j, m->rest + 3 * j, offset);
         for (int c = 0; c < 3; c++) {
-            memcpy(to + 4 * c, s->turns + 9 * j + 3 * c, 3 * sizeof(float));
+            memcpy(to + 4 * c, s->global + 9 * j + 3 * c, 3 * sizeof(float));
             to[4 * c + 3] = s->positions[3 * j + c] - offset[c];
         }
     }
@@ -370,7 +370,7 @@ static void skin(const psi_model *m, psi_state *s, const float *garment, float *
         const float *x = garment + v, *y = x + count, *z = y + count;
         float moved[3][LANES] = {{0}}, shown[LANES][3];
         for (int32_t k = 0; k < m->moving; k++) {
-            const float *w = m->weight + (size_t)k * padded + v, *a = s->movers + 12 * k;
+            const float *w = m->weight + (size_t)k * padded + v, *a = s->skinning + 12 * k;
             for (int i = 0; i < LANES; i++) {
                 moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
                 moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
@@ -395,12 +395,12 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
         memcpy(s->rotations, rotations, 9 * joints * sizeof(float));
         memcpy(s->translation, translation, 3 * sizeof(float));
     }
-    kinematics(m, s->rotations, s->turns, s->positions);
+    kinematics(m, s->rotations, s->global, s->positions);
     pose_inputs(m, s, s->inputs);
     for (int32_t i = 0; i < m->pose.inputs; i++) s->inputs[i] -= m->pose_mean[i];
-    const int ordinary = bring(s->inputs, &m->pose_bounds, m->pose.inputs);
+    const int ordinary = clamp(s->inputs, &m->pose_bounds, m->pose.inputs);
     predict(m, s);
-    const int inside = bring(s->next, &m->code_bounds, m->code);
+    const int inside = clamp(s->next, &m->code_bounds, m->code);
     float *swap = s->latent;
     s->latent = s->next, s->next = swap;
     if (vertices) skin(m, s, decode(m, s), vertices);
@@ -422,8 +422,8 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->rotations = part(room, &used, 27 * joints);
     s->positions = part(room, &used, 9 * joints);
     s->translation = part(room, &used, 9);
-    s->turns = part(room, &used, 9 * joints);
-    s->movers = part(room, &used, 12 * joints);
+    s->global = part(room, &used, 9 * joints);
+    s->skinning = part(room, &used, 12 * joints);
     s->inputs = part(room, &used, m->longest);
     for (int i = 0; i < 3; i++) s->rows[i] = part(room, &used, widest);
     s->fixed = (int16_t *)part(room, &used, m->longest / 2);
@@ -447,7 +447,7 @@ psi_state *psi_begin(const psi_model *m, const float *rotations, const float *tr
         for (size_t j = 0; j < joints; j++)
             for (int c = 0; c < 3; c++) s->rotations[9 * j + 4 * c] = 1.0f;
     }
-    kinematics(m, s->rotations, s->turns, s->positions);
+    kinematics(m, s->rotations, s->global, s->positions);
     memcpy(s->rotations + 9 * joints, s->rotations, 9 * joints * sizeof(float));
     memcpy(s->positions + 3 * joints, s->positions, 3 * joints * sizeof(float));
     memcpy(s->translation + 3, s->translation, 3 * sizeof(float));

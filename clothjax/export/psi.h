@@ -4,7 +4,7 @@
  *
  *     cc -O3 -march=native -c psi.c
  *
- * a compiler turns the loops into the dot products of bytes that a processor has. Rotations are 3 x 3 matrices, row
+ * a compiler turns the loops into the vector instructions that a processor has. Rotations are 3 x 3 matrices, row
  * by row, local to the parent joint, the identity in the body's canonical pose; the translation is that of the root
  * from its canonical place. All lengths are metres, up is +Y. The JSON beside a GARMENT.psi names the joints.
  */

@@ -40,12 +40,14 @@ int main(int count, char **arguments) {
 
     const size_t turns = 9 * (size_t)psi_joints(model), size = 3 * (size_t)psi_vertices(model);
     float *pose = malloc((turns + 3) * sizeof *pose), *vertices = malloc(size * sizeof *vertices);
+    if (!pose || !vertices) return fail(arguments[1], "no memory");
     double *taken = NULL;
     psi_state *character = NULL;
     size_t frames = 0;
     while (fread(pose, sizeof *pose, turns + 3, motion) == turns + 3) {
         if (!character) character = psi_begin(model, pose, pose + turns);
         taken = realloc(taken, (frames + 1) * sizeof *taken);
+        if (!character || !taken) return fail(arguments[1], "no memory");
         const double began = microseconds();
         psi_step(model, character, pose, pose + turns, vertices);
         taken[frames++] = microseconds() - began;

@@ -114,10 +114,10 @@ int main(int count, char **arguments) {
     const OrtValue *given[INPUTS] = {in[0].value, in[1].value, in[2].value, in[3].value};
     OrtValue *found[OUTPUTS] = {out[0].value, out[1].value, out[2].value, out[3].value};
 
-    char *about = malloc(strlen(arguments[1]) + 6), *dot;
-    strcpy(about, arguments[1]);
-    dot = strrchr(about, '.');
-    strcpy(dot ? dot : about + strlen(about), ".json");
+    const size_t stem = strlen(arguments[1]) - strlen(".onnx");
+    if (strlen(arguments[1]) < 6 || strcmp(arguments[1] + stem, ".onnx")) fail(arguments[1], "is not called .onnx");
+    char *about = malloc(stem + sizeof ".json");
+    sprintf(about, "%.*s.json", (int)stem, arguments[1]);
     FILE *motion = fopen(arguments[2], "rb"), *shown = fopen(arguments[3], "wb");
     if (!motion || !shown) fail(motion ? arguments[3] : arguments[2], "cannot be opened");
 
