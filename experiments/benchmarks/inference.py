@@ -326,6 +326,6 @@ def plot(report: dict, path: Path) -> None:
     axis.set(xscale="log", xlabel="us a frame, one thread", ylabel="mean error, mm (1e-4: that or less)")
     axis.set(ylim=(5e-5, 30), xlim=(0.7 * points[0][0], 2 * points[-1][0]))
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(loc="center right")
+    axis.legend(loc="upper right")
     figure.savefig(path, dpi=110)
     plt.close(figure)
