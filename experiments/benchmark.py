@@ -11,9 +11,9 @@ run, that they make. `scenes` are of the quickstart's network on the same garmen
 cost against the vertices, or of error against time.
 
 `inference` times one frame on one thread, with weights in the cache: the paper's Psi (random weights, 4 000 vertices),
-NCS's network at its published sizes, and a trained garment of the library in its variants, whose `error_mm` is the mean
-distance of vertices to jax's unspecialised model over 300 frames of closed loop. `floor_us` is how long this machine
-takes to read as many bytes.
+NCS's network at its published sizes, and a trained garment of the library in its variants (in plain C too where there
+is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over 300 frames of closed
+loop. `floor_us` is how long this machine takes to read as many bytes.
 """
 
 import argparse

@@ -59,10 +59,9 @@ class Outfit:
 
     def psi(self, poses: list[Pose]) -> np.ndarray:
         """Vertices [N, V, 3] m of the next frame of the characters, whose poses these are."""
+        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses)))
         if self._states is None:
-            state = inference.initial_state(self.model, poses[0])
-            self._states = jax.tree.map(lambda x: jnp.stack([x] * self.count), state)
-        given = Pose(*(np.stack(each) for each in zip(*poses)))
+            self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(given)
         self._states, vertices = inference.step_crowd(self._crowd, self._states, given)
         return np.asarray(vertices)
 
@@ -120,7 +119,7 @@ class Comparison:
         material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
         return characters.dress(self.scene, jnp.asarray(betas, jnp.float32), material, self.config.physics)
 
-    def step(self, stage: str, character, before: tuple | None, window: Pose) -> tuple[tuple, np.ndarray]:
+    def step(self, stage: str, character, before: tuple | None, window: Pose) -> tuple:
         """What a stage goes on from in the frame after the next, and the vertices [V, 3] m of the next, in the world.
 
         Args:

@@ -8,7 +8,6 @@ stopped.
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -18,8 +17,6 @@ from clothjax import configuration, experiment, latent_predictor, stage2, traine
 from clothjax.config import Config
 from experiments.session import fail_clearly, setup
 from experiments.train import refine
-
-REFINED = "refined.json"  # of what, and the hours of its training before that
 
 
 def main(argv: list[str]) -> None:
@@ -40,9 +37,6 @@ def main(argv: list[str]) -> None:
     normalizers = normalizers._replace(pose=latent_predictor.widened(normalizers.pose, seen))
     refined = refine(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
     size = trained.write(given.out, config, phi, jax.device_get(refined.state.average), normalizers)
-    before = folder / "report.json"
-    hours = json.loads(before.read_text())["hours"] if before.is_file() else 0.0
-    (given.out / REFINED).write_text(json.dumps({"garment": str(given.garment), "hours": hours}) + "\n")
     print(f"{given.out}: {size / 1e6:.2f} MB of weights")
 
 

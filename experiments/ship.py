@@ -1,7 +1,6 @@
 """Packs a finished run as a garment that comes with the library, with what was measured of it.
 
     python -m experiments.ship runs/skirt skirt
-    python -m experiments.ship runs/refined_skirt skirt      # what experiments.refine has made of it
 
 It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
 the validation motions, with the command that trained it and its hours.
@@ -9,14 +8,12 @@ the validation motions, with the command that trained it and its hours.
 
 import argparse
 import json
-import shutil
 import sys
 from pathlib import Path
 
 from clothjax import trained
 from clothjax.run_folder import add_seconds, read_seconds
 from experiments.evaluate import pretrained, table
-from experiments.refine import REFINED
 from experiments.session import fail_clearly, setup
 
 
@@ -26,23 +23,17 @@ def main(argv: list[str]) -> None:
     parser.add_argument("name", help="of the garment")
     arguments = parser.parse_args(argv)
     folder = trained.MODELS / arguments.name
-    hours = 0.0
-    if trained.packed(arguments.run):
-        hours = json.loads((arguments.run / REFINED).read_text())["hours"]
-        for name in (trained.WEIGHTS, trained.CONFIG):
-            shutil.copyfile(arguments.run / name, folder / name)
-    else:
-        size = trained.pack(arguments.run, folder)
-        print(f"{folder}: {size / 1e6:.2f} MB of weights")
+    size = trained.pack(arguments.run, folder)
+    print(f"{folder}: {size / 1e6:.2f} MB of weights")
     report = pretrained({arguments.name: folder})[arguments.name]
     config, _ = trained.phi(folder)
     seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
     seconds += sum(add_seconds(arguments.run).values())
     about = {
-        # the configuration is whole: it trains the same again, but that a refinement then begins at unrounded weights
+        # the configuration is whole: it trains the same again
         "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
         "seed": config.stage1.seed,
-        "hours": hours + seconds / 3600,
+        "hours": seconds / 3600,
     }
     (folder / "report.json").write_text(json.dumps(about | report, indent=1) + "\n")
     print(table(report))

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import clothjax as cj
-from clothjax import motion_matching, rollout, skinning, storage, trained
+from clothjax import features, motion_matching, rollout, skinning, storage, trained
+from clothjax.config import MaterialConfig
 from clothjax.types import Material, Pose
 from experiments import demo, live
 
@@ -133,6 +134,15 @@ def test_random_steering_leaves_nothing_infinite(clips, frames):
         assert np.isfinite(garments["psi"]).all() and np.isfinite(bodies[0]).all()
         height = garments["psi"][0][:, 1]
         assert height.min() > bodies[0][:, 1].min() - 0.3 and height.max() < bodies[0][:, 1].max() + 0.1
+
+
+@pytest.mark.parametrize("name", ["mu", "density"])  # logarithmic; not
+def test_a_slider_is_a_share_of_the_training_range(name):
+    between = getattr(MaterialConfig(), f"{name}_range")
+    for share, value in ((0.0, between.low), (1.0, between.high)):
+        assert features.unscaled(share, between) == pytest.approx(value)
+    assert features.scaled(features.unscaled(0.3, between), between) == pytest.approx(0.3)
+    assert features.unscaled(0.5, MaterialConfig().mu_range) == pytest.approx(np.sqrt(15909.0 * 63636.0))
 
 
 def test_strain_is_that_of_the_edges():
