@@ -103,6 +103,8 @@ def pass_messages(
     config: ModelConfig,
 ) -> Array:
     """Encode and Process: node latents [V, W] of the garment from features."""
+    if config.bfloat16:
+        params = graph_network.in_bfloat16(params)
     encoder = params["encoder"]
     pinned = scene.garment.pinned.astype(jnp.int32)
     kinds = params["type_embedding"]

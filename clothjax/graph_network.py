@@ -27,8 +27,23 @@ def init_dense(key: Array, inputs: int, outputs: int, gain: float = 2.0) -> Para
 
 
 def dense(params: Params, x: Array) -> Array:
-    """A dense layer on [..., inputs]."""
-    return nn.Dense(params["kernel"].shape[-1]).apply({"params": params}, x)
+    """A dense layer on [..., inputs], in the kernel's precision."""
+    kernel = params["kernel"]
+    return nn.Dense(kernel.shape[-1], dtype=kernel.dtype).apply({"params": params}, x).astype(x.dtype)
+
+
+def _times(x: Array, kernel: Array) -> Array:
+    """x [..., inputs] times a kernel [inputs, outputs] in the kernel's precision, given in that of x."""
+    return (x.astype(kernel.dtype) @ kernel).astype(x.dtype)
+
+
+def in_bfloat16(params: Params) -> Params:
+    """The same layers with their kernels in bfloat16, so that products are, and their gradients; nothing else is."""
+
+    def rounded(path, leaf):
+        return leaf.astype(jnp.bfloat16) if path[-1] == jax.tree_util.DictKey("kernel") else leaf
+
+    return jax.tree_util.tree_map_with_path(rounded, params)
 
 
 def init_mlp(key: Array, sizes: tuple[int, ...], norm: bool = True, last_gain: float = 1.0) -> Params:
@@ -202,15 +217,15 @@ def _block(params, nodes, body, edges, pairs, rows, graph, slots, active, tail):
 def _node_update(params: Params, nodes: Array, rows: Any, arrived: Array, tail: Callable) -> Array:
     """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
     kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
-    own = nodes @ kernel[: nodes.shape[-1]] + bias[None]
-    return tail(params, own.at[rows].add(arrived @ kernel[-arrived.shape[-1] :]))
+    own = _times(nodes, kernel[: nodes.shape[-1]]) + bias[None]
+    return tail(params, own.at[rows].add(_times(arrived, kernel[-arrived.shape[-1] :])))
 
 
 def _message(params, targets, sources, latent, target_index, source_index, tail):
     """MLP([target, source, edge]) with the node parts of its first layer multiplied before the gather."""
     width = latent.shape[-1]
     kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
-    target, source = targets @ kernel[:width], sources @ kernel[width : 2 * width]
+    target, source = _times(targets, kernel[:width]), _times(sources, kernel[width : 2 * width])
     target = target if target_index is None else target[target_index]
     source = source if source_index is None else source[source_index]
-    return tail(params, target + source + latent @ kernel[2 * width :] + bias[None])
+    return tail(params, target + source + _times(latent, kernel[2 * width :]) + bias[None])

@@ -70,7 +70,7 @@ def test_stages_beside_each_other_wear_the_same_skirt(clips):
         for i, stage in enumerate(show.stages):
             apart = np.linalg.norm(garments[stage][0] - [i * live.APART, 0, 0] - garments["psi"][0], axis=-1)
             assert apart[pinned].max() < 1e-3, (t, stage)
-            assert apart.max() < 0.3 and (apart.mean() < 0.06 or stage == "skinning"), (t, stage)
+            assert apart.max() < 0.3 and (apart.mean() < 0.1 or stage == "skinning"), (t, stage)
     faces, rest = show.outfit.mesh("phi")
     assert faces.shape == show.outfit.mesh("psi")[0].shape
     assert live.strain(rest, rest, faces).max() == 0

@@ -1,5 +1,7 @@
 """Message passing with its blocks recomputed, and in chunks, is the same function."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +54,30 @@ def test_recomputed_blocks_give_the_same_nodes_and_gradients(monkeypatch, chunk)
         kept, recomputed = (jax.tree.leaves(step(inputs, remat)) for remat in (False, True))
     for one, other in zip(kept, recomputed, strict=True):
         np.testing.assert_allclose(np.asarray(one), np.asarray(other), atol=1e-13)
+
+
+@pytest.mark.parametrize("remat", [False, True])
+def test_in_bfloat16_every_product_is_and_nothing_that_is_kept(remat):
+    loss, inputs = problem()
+    inputs = jax.tree.map(lambda x: x.astype(jnp.float32), inputs)
+
+    def rounded(inputs):
+        return loss(inputs | {"params": graph_network.in_bfloat16(inputs["params"])}, remat)
+
+    step = jax.grad(rounded, has_aux=True)
+    products = re.findall(r"(\w+)\[([\d,]*)\] = dot_general", str(jax.make_jaxpr(step)(inputs)))
+    sums_of_rows = f"1,{WIDTH}"  # of a LayerNorm, backward
+    assert {kind for kind, shape in products if shape != sums_of_rows} == {"bf16"}
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(step(inputs)))
+
+
+def test_a_product_in_bfloat16_is_that_of_rounded_numbers():
+    params = graph_network.init_dense(jax.random.key(0), 40, 6) | {"bias": jnp.arange(6.0)}
+    x = jax.random.normal(jax.random.key(1), (50, 40))
+    low = np.asarray(graph_network.dense(graph_network.in_bfloat16({"dense": params})["dense"], x))
+    a, b = (np.asarray(each.astype(jnp.bfloat16), np.float64) for each in (x, params["kernel"]))
+    np.testing.assert_allclose(low, a @ b + np.asarray(params["bias"]), rtol=2**-7, atol=2**-7)
+    assert np.abs(low - np.asarray(graph_network.dense(params, x))).max() > 1e-4
 
 
 def test_recomputed_blocks_take_less_memory():

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jax.experimental.compilation_cache import compilation_cache
 
 from clothjax import compact_latent, experiment, fit, graph_sampling, losses, mesh_convolution, solver
@@ -15,6 +16,7 @@ from clothjax import stage1 as training
 from clothjax.clips import Clips
 from clothjax.config import Config
 from clothjax.experiment import Experiment
+from clothjax.graph_network import Params
 from experiments.benchmarks import textbook, timing
 from experiments.benchmarks.timing import against_peaks, cost, interleaved, program, temporary_bytes
 from experiments.session import progress
@@ -61,8 +63,10 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
     forms = {"ours": compact_latent.pass_messages, "textbook": textbook.process}
     arguments = (params, state.statistics, moment.first.seen)
     kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
+    rounded = dataclasses.replace(recomputed, bfloat16=True)
     programs = {
         "ours": program(loss(forms["ours"], recomputed), *arguments),
+        "ours, products in bfloat16": program(loss(forms["ours"], rounded), *arguments),
         "ours, nothing recomputed": program(loss(forms["ours"], kept), *arguments),
         "textbook": program(loss(forms["textbook"], kept), *arguments),
     }
@@ -77,6 +81,7 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
         return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
 
     single = difference()
+    exact, low = (programs[name](*arguments)[1] for name in ("ours", "ours, products in bfloat16"))
     with jax.enable_x64(True):
         arguments = jax.tree.map(solver.to_float64, arguments)
         double = difference()
@@ -85,8 +90,16 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
         "processor_memory_ratio": memory["ours"] / memory["textbook"],
         "processor_error_float32": single,
         "processor_error_float64": double,
+        "bfloat16_speedup": seconds["ours"] / seconds["ours, products in bfloat16"],
+        "bfloat16_gradient_error": _apart(low, exact),
         "processor": {name: {"seconds": seconds[name], "temporary_mib": memory[name] / 2**20} for name in programs},
     }
+
+
+def _apart(one: Params, other: Params) -> float:
+    """The norm of the difference of two gradients, over that of the second."""
+    difference = optax.global_norm(jax.tree.map(jnp.subtract, one, other))
+    return float(difference / optax.global_norm(other))
 
 
 def convolution(whole: Experiment, rounds: int) -> dict:
