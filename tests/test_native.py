@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from test_export import motion as dance
 
 import clothjax as cj
 from clothjax import folding, inference
-from clothjax.export import native
+from clothjax.export import native, psi_ffi
 from clothjax.types import Pose
 from experiments import convert
 
@@ -105,6 +106,54 @@ def test_a_garment_that_nobody_sees_goes_on(library, model, motion, tmp_path):
         seen.step(motion.rotations[t], motion.translation[t])
         unseen.step(motion.rotations[t], motion.translation[t], vertices=t == 19)
     np.testing.assert_array_equal(seen.vertices, unseen.vertices)
+
+
+@pytest.fixture(scope="module")
+def packed(model):
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    return psi_ffi.pack(model)
+
+
+def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
+    """Bit for bit, in a scan, through frames of NaN, also while nobody sees the garment."""
+    rotations, translation = np.array(motion.rotations[:30], np.float32), np.array(motion.translation[:30], np.float32)
+    rotations[11, 2] = np.nan
+    poses = Pose(jnp.asarray(rotations), jnp.asarray(translation))
+    first = inference.initial_state(model, jax.tree.map(lambda x: x[0], poses))
+
+    def frame(state, pose):
+        unseen, nothing = psi_ffi.step(packed, state, pose, vertices=False)
+        state, vertices = psi_ffi.step(packed, state, pose)
+        assert nothing is None
+        same = jax.tree.map(lambda a, b: jnp.all((a == b) | jnp.isnan(a)), unseen, state)
+        return state, (vertices, state.ok, jnp.stack(jax.tree.leaves(same)))
+
+    _, (vertices, ok, same) = jax.jit(lambda s, p: jax.lax.scan(frame, s, p))(first, poses)
+    psi = native.Psi(library, native.to_c(model, tmp_path / "g.psi"), rotations[0], translation[0])
+    for t in range(30):
+        assert psi.step(rotations[t], translation[t]) == bool(ok[t])
+        np.testing.assert_array_equal(vertices[t], psi.vertices)
+    assert np.asarray(same).all() and not ok[11] and ok[:11].all()
+
+
+def test_c_inside_of_jax_for_several_at_once(packed, model, motion):
+    poses = Pose(*(jnp.asarray(x[[0, 20, 40]], jnp.float32) for x in motion[:2]))
+    states = jax.vmap(lambda pose: inference.initial_state(model, pose))(poses)
+    _, together = jax.vmap(lambda s, p: psi_ffi.step(packed, s, p))(states, poses)
+    for i in range(3):
+        _, alone = psi_ffi.step(packed, *jax.tree.map(lambda x, i=i: x[i], (states, poses)))
+        np.testing.assert_array_equal(together[i], alone)
+
+
+def test_c_inside_of_jax_refuses_what_is_not_its_own(packed, model, motion):
+    pose = Pose(*(jnp.asarray(x[0], jnp.float32) for x in motion[:2]))
+    state = inference.initial_state(model, pose)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the state or the pose is of another garment"):
+        psi_ffi.step(packed, state._replace(latent=state.latent[1:]), pose)[1].block_until_ready()
+    damaged = dataclasses.replace(packed, file=packed.file[:-64])
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"a damaged \.psi"):
+        psi_ffi.step(damaged, state, pose)[1].block_until_ready()
 
 
 def made(folder, *flags):

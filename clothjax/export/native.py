@@ -32,14 +32,17 @@ def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
         about: more entries for the JSON.
     """
     path = Path(path)
-    with path.open("wb") as file:
-        for array in _arrays(model):
-            data = array.astype(array.dtype.newbyteorder("<")).tobytes()
-            file.write(data + bytes(-len(data) % ALIGN))
+    path.write_bytes(packed(model))
     sidecar.write(model, path, "world", {"driven": "by psi.c: see psi.h"} | (about or {}))
     for source in SOURCES:
         shutil.copyfile(source, path.parent / source.name)
     return path
+
+
+def packed(model: Model) -> bytes:
+    """What is in the file of a model."""
+    parts = (array.astype(array.dtype.newbyteorder("<")).tobytes() for array in _arrays(model))
+    return b"".join(part + bytes(-len(part) % ALIGN) for part in parts)
 
 
 def _arrays(model: Model) -> Iterator[np.ndarray]:
@@ -117,15 +120,23 @@ def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
     Raises:
         OSError: if there is no compiler, or it fails.
     """
-    program = compiler()
-    if program is None:
-        raise OSError("no C compiler (cc, gcc or clang) on the path")
     library = Path(directory) / "libpsi.so"
-    command = [program, *flags, "-fPIC", "-shared", "-o", str(library), str(SOURCES[1]), "-lm"]
+    compiled(compiler(), [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
+    return library
+
+
+def compiled(program: str | None, arguments: list[str | Path]) -> None:
+    """A compiler has done as it was told.
+
+    Raises:
+        OSError: if there is none, or it fails.
+    """
+    if program is None:
+        raise OSError("no compiler on the path: install gcc or clang")
+    command = [program, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
-    return library
 
 
 class Psi:

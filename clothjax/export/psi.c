@@ -171,6 +171,22 @@ static psi_model *failed(psi_model *m, const char **error, const char *why) {
     return NULL;
 }
 
+static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char **error) {
+    const int32_t version[2] = {0x00495350, 1}; /* "PSI" */
+    if (size < ALIGN || memcmp(bytes, version, sizeof version)) return failed(m, error, "not a .psi of this version");
+    reader r = {bytes, size, 1};
+    read_model(&r, m);
+    if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
+    return m;
+}
+
+psi_model *psi_open(const void *bytes, size_t size, const char **error) {
+    psi_model *m = calloc(1, sizeof *m);
+    if (!m) return failed(m, error, "no memory");
+    if ((uintptr_t)bytes % sizeof(float)) return failed(m, error, "not at a multiple of 4");
+    return parse(m, bytes, size, error);
+}
+
 psi_model *psi_load(const char *path, const char **error) {
     FILE *file = fopen(path, "rb");
     psi_model *m = calloc(1, sizeof *m);
@@ -185,12 +201,7 @@ psi_model *psi_load(const char *path, const char **error) {
     size_t got = bytes ? fread(bytes, 1, size, file) : 0;
     fclose(file);
     if (size < ALIGN || got != (size_t)size) return failed(m, error, "the file cannot be read");
-    const int32_t version[2] = {0x00495350, 1}; /* "PSI" */
-    if (memcmp(bytes, version, sizeof version)) return failed(m, error, "not a .psi of this version");
-    reader r = {bytes, (size_t)size, 1};
-    read_model(&r, m);
-    if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
-    return m;
+    return parse(m, bytes, (size_t)size, error);
 }
 
 void psi_free(psi_model *m) {
@@ -457,4 +468,20 @@ psi_state *psi_begin(const psi_model *m, const float *rotations, const float *tr
 void psi_end(psi_state *s) {
     if (s) free(s->memory);
     free(s);
+}
+
+int psi_carried(const psi_model *m) { return m->code + 24 * m->joints + 6; }
+
+void psi_keep(const psi_model *m, const psi_state *s, float *carried) {
+    memcpy(carried, s->latent, m->code * sizeof(float));
+    memcpy(carried += m->code, s->rotations, 18 * m->joints * sizeof(float));
+    memcpy(carried += 18 * m->joints, s->positions, 6 * m->joints * sizeof(float));
+    memcpy(carried + 6 * m->joints, s->translation, 6 * sizeof(float));
+}
+
+void psi_put_back(const psi_model *m, psi_state *s, const float *carried) {
+    memcpy(s->latent, carried, m->code * sizeof(float));
+    memcpy(s->rotations, carried += m->code, 18 * m->joints * sizeof(float));
+    memcpy(s->positions, carried += 18 * m->joints, 6 * m->joints * sizeof(float));
+    memcpy(s->translation, carried + 6 * m->joints, 6 * sizeof(float));
 }

@@ -11,6 +11,8 @@
 #ifndef PSI_H
 #define PSI_H
 
+#include <stddef.h>
+
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -20,6 +22,8 @@ typedef struct psi_state psi_state; /* of one character: what goes on from frame
 
 /* NULL where the file cannot be read, and then what is wrong with it in `error`, unless that is NULL. */
 psi_model *psi_load(const char *path, const char **error);
+/* The same of a file that is in memory already, at a multiple of 4, better of 64: it has to stay there. */
+psi_model *psi_open(const void *bytes, size_t size, const char **error);
 void psi_free(psi_model *model);
 
 int psi_joints(const psi_model *model);
@@ -35,6 +39,12 @@ void psi_end(psi_state *state);
  * 0 where the pose, the wearer or the code was out of the range of training and was brought into it. */
 int psi_step(const psi_model *model, psi_state *state, const float *rotations, const float *translation,
              float *vertices);
+
+/* What of a state goes on from frame to frame, psi_carried() floats, to be kept and put back: the code, then of the last
+ * two poses, newest first, the rotations, the joints' positions [2][joints][3] and the translations. */
+int psi_carried(const psi_model *model);
+void psi_keep(const psi_model *model, const psi_state *state, float *carried);
+void psi_put_back(const psi_model *model, psi_state *state, const float *carried);
 
 #ifdef __cplusplus
 }

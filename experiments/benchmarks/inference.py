@@ -14,7 +14,7 @@ import onnxruntime
 
 from clothjax import configuration, experiment, folding, garment_model, inference, latent_predictor, storage
 from clothjax.config import Config
-from clothjax.export import native, onnx, stablehlo
+from clothjax.export import native, onnx, psi_ffi, stablehlo
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.inference import Model
 from clothjax.latent_predictor import Normalizers, Scale
@@ -151,6 +151,8 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
             path = onnx.to_onnx(folded, folder / "form.onnx", int8=int8, output=output)
             calls[f"{output}{kind}"] = onnx_call(path, folded)
         calls[f"on 4 000 vertices{kind}"] = onnx_call(onnx.to_onnx(fine, folder / "fine.onnx", int8=int8), fine)
+    if psi_ffi.available():
+        calls["jax: plain C inside"] = packed_call(folded)
     if library:
         calls["C: off screen"] = c_call(library, native.to_c(folded, folder / "form.psi"), folded, vertices=False)
         calls["C: on 4 000 vertices"] = c_call(library, native.to_c(fine, folder / "fine.psi"), fine)
@@ -269,6 +271,14 @@ def jax_call(model: Model, vertices: bool = True) -> Call:
     state = inference.initial_state(model, pose)
     compiled = inference.step.lower(model, state, pose, vertices).compile()
     return lambda: jax.block_until_ready(compiled(model, state, pose))
+
+
+def packed_call(model: Model) -> Call:
+    """One frame in jax, compiled, that calls plain C."""
+    pose, packed = _pose(model), psi_ffi.pack(model)
+    state = inference.initial_state(model, pose)
+    compiled = psi_ffi.step.lower(packed, state, pose).compile()
+    return lambda: jax.block_until_ready(compiled(packed, state, pose))
 
 
 def _pose(model: Model) -> Pose:

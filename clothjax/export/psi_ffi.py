@@ -1,0 +1,80 @@
+"""`psi.c` inside of jax, on a CPU: the same step as `clothjax.inference.step`, in eight bits and plain C.
+
+XLA has no fast product of a vector and a matrix of low precision; `psi.c` has. Where there are a C and a C++ compiler,
+it is built when a model is first packed, and registered with `jax.ffi`.
+"""
+
+import ctypes
+import dataclasses
+import functools
+import shutil
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from clothjax.export import native
+from clothjax.inference import Model, State
+from clothjax.types import Array, Pose
+
+SOURCE = Path(__file__).with_name("psi_ffi.cc")
+TARGET = "clothjax_psi_step"
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("file",), meta_fields=("vertices",))
+@dataclasses.dataclass(frozen=True)
+class Packed:
+    """A garment on a character in plain C."""
+
+    file: Array  # [bytes] uint8, a .psi
+    vertices: int
+
+
+def available() -> bool:
+    """Whether there are the compilers."""
+    return None not in (native.compiler(), _compiler())
+
+
+def _compiler() -> str | None:
+    return next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+
+
+def pack(model: Model) -> Packed:
+    """A model for `step`, best a specialised one: one wearer's, on a CPU.
+
+    Raises:
+        OSError: if a compiler is missing, or fails.
+    """
+    _register()
+    return Packed(jnp.asarray(np.frombuffer(native.packed(model), np.uint8)), model.wearer.template.shape[1])
+
+
+@functools.cache
+def _register() -> None:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        plain, library = Path(folder) / "psi.o", Path(folder) / "libpsi_ffi.so"
+        native.compiled(native.compiler(), [*native.FLAGS, "-fPIC", "-c", native.SOURCES[1], "-o", plain])
+        includes = [f"-I{folder}" for folder in (native.SOURCES[0].parent, jax.ffi.include_dir())]
+        shared = ["-std=c++17", "-O2", "-fPIC", "-shared", *includes, SOURCE, plain, "-o", library]
+        native.compiled(_compiler(), shared)
+        handler = ctypes.CDLL(str(library)).PsiStep  # it stays loaded when its file is gone
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
+
+
+@functools.partial(jax.jit, static_argnames="vertices")
+def step(packed: Packed, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
+    """`inference.step` of a packed model, from a state that `inference.initial_state` gave of the model itself.
+
+    Raises:
+        jax.errors.JaxRuntimeError: for a state or a pose of another garment, or a damaged file.
+    """
+    carried, restored = ravel_pytree(state[:4])
+    seen = (packed.vertices if vertices else 0, 3)
+    kinds = [jax.ShapeDtypeStruct(carried.shape, jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_),
+             jax.ShapeDtypeStruct(seen, jnp.float32)]  # fmt: skip
+    call = jax.ffi.ffi_call(TARGET, kinds, vmap_method="sequential")
+    carried, ok, found = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose))
+    return State(*restored(carried), ok), found if vertices else None
