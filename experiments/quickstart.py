@@ -17,6 +17,7 @@ import numpy as np
 
 from clothjax import configuration, experiment, folding, inference
 from clothjax.config import Config
+from clothjax.export.gltf import to_glb
 from clothjax.export.onnx import run_onnx, to_onnx
 from clothjax.types import Motion
 from experiments import render
@@ -48,9 +49,10 @@ def main(argv: list[str]) -> None:
     part = Motion(clip.rotations[:ONNX_FRAMES], (clip.translation[:ONNX_FRAMES] - origin).astype(np.float32), clip.fps)
     onnx = to_onnx(folding.specialise(model), directory / "tshirt.onnx")
     onnx_error = np.linalg.norm(run_onnx(onnx, model, part) - inference.animate(model, part)[0], axis=-1).max()
-    glb_error = render.write_glb(directory, whole, motion, directory / "tshirt.glb", config.evaluation.animation_frames)
+    performance = render.perform(directory, whole, motion, config.evaluation.animation_frames)
+    glb_error = to_glb(directory / "tshirt.glb", performance)
     render.write_comparison(directory, whole, motion, directory / "comparison.png")
-    render.write_webp(directory, whole, motion, directory / "walk.webp", config.evaluation.animation_frames)
+    render.WRITERS[".webp"](directory / "walk.webp", performance)
 
     report = {
         "quickstart": {

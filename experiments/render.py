@@ -1,16 +1,18 @@
 """Pictures and animations of a trained garment.
 
     python -m experiments.render runs/quickstart --motion walk_3 --out walk.webp
-    python -m experiments.render runs/quickstart --motion dance_0 --out dance.glb
     python -m experiments.render runs/quickstart --motion walk_3 --out comparison.png
-    python -m experiments.render --pretrained skirt --motion dance_3 --out skirt.webp
+    python -m experiments.render --pretrained skirt --motion dance_3 --out skirt.mp4
+    python -m experiments.render --pretrained skirt --motion dance_3 --out skirt.usdc
 
-.webp is an animation of Psi on the body, .glb the same for a viewer; .png compares skinning, Phi, Psi and the
-reference solver on a clip that `experiments.evaluate` has measured.
+Psi on the body as a film (.webp, .mp4); for a viewer or an animation program with both as meshes (.glb, .usdc, .usda,
+or .obj, one file a frame) or the garment's vertices alone (.pc2, .mdd, with an .obj of the mesh to put them on). .png
+compares skinning, Phi, Psi and the reference solver on a clip that `experiments.evaluate` has measured.
 """
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -18,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import animation, experiment, inference, skinning, trained
-from clothjax.animation import SKIN, Surface
+from clothjax.animation import CLOTH, SKIN, Surface
 from clothjax.experiment import Experiment
-from clothjax.export import gltf
+from clothjax.export import gltf, point_cache, usd
+from clothjax.export.performance import Part, Performance
 from clothjax.types import Motion, Pose
 from experiments.evaluate import kept, psi_trajectory
 from experiments.session import fail_clearly, progress, setup
@@ -35,49 +38,52 @@ def main(argv: list[str]) -> None:
     parser.add_argument("run", type=Path, nargs="?", help="folder of a finished run")
     parser.add_argument("--pretrained", default=None, help="name of a garment that comes with the library")
     parser.add_argument("--motion", default=None, help="asset name or path; default: the configured one")
-    parser.add_argument("--out", type=Path, required=True, help="a .webp, .glb or .png")
+    parser.add_argument("--out", type=Path, required=True, help=f"a file of .png, {', '.join(WRITERS)}")
     parser.add_argument("--frames", type=int, default=None, help="at the most; default: the configured number")
     arguments = parser.parse_args(argv)
-    writers = {".webp": write_webp, ".glb": write_glb, ".png": write_comparison}
-    if arguments.out.suffix not in writers:
-        raise ValueError(f"{arguments.out}: cannot write {arguments.out.suffix!r}; allowed: {', '.join(writers)}")
+    kind = arguments.out.suffix
+    if kind != ".png" and kind not in WRITERS:
+        raise ValueError(f"{arguments.out}: cannot write {kind!r}; allowed: .png, {', '.join(WRITERS)}")
     if (arguments.run is None) == (arguments.pretrained is None):
         raise ValueError("give the folder of a run, or --pretrained with the name of a garment")
     run = arguments.run or trained.folder(arguments.pretrained)
     whole, _ = load_phi(run)
     motion = arguments.motion or whole.config.evaluation.motions[0]
     frames = arguments.frames or whole.config.evaluation.animation_frames
-    writers[arguments.out.suffix](run, whole, motion, arguments.out, frames)
+    if kind == ".png":
+        write_comparison(run, whole, motion, arguments.out)
+    else:
+        WRITERS[kind](arguments.out, perform(run, whole, motion, frames))
     print(f"written to {arguments.out}")
 
 
-def write_webp(run: Path, whole: Experiment, motion: str, out: Path, frames: int) -> None:
-    """Psi on the body, the camera going with it."""
+def perform(run: Path, whole: Experiment, motion: str, frames: int) -> Performance:
+    """Psi on the body over the frames of a clip, or alone where the scene has no body."""
     clip = experiment.motion(whole, motion)
     garment = psi_trajectory(inference.load(run, betas=experiment.betas(whole.config)), clip)[:frames]
     body, root = body_trajectory(whole, clip)
-    floor = float((body + root[:, None])[..., 1].min())
-    camera = animation.camera_for(body)
-    pictures = []
-    with progress("rendering", len(garment)) as report:
-        for t in range(len(garment)):
-            # the camera goes along, but does not bob
-            height = np.array([0.0, root[t, 1], 0.0])
-            surfaces = dressed(whole, body[t] + height, garment[t] + height)
-            pictures.append(animation.render(surfaces, camera, SIZE, floor=floor))
-            report(t + 1)
-    animation.webp(out, pictures, clip.fps)
+    parts = (Part("body", body[:frames], whole.body.faces, SKIN), Part("garment", garment, whole.garment.faces, CLOTH))
+    return Performance(parts if whole.scene.touchable else parts[1:], root[:frames], clip.fps)
 
 
-def write_glb(run: Path, whole: Experiment, motion: str, out: Path, frames: int) -> dict[str, float]:
-    """Psi on the body as glTF; returns the error of its compression in m."""
-    clip = experiment.motion(whole, motion)
-    garment = psi_trajectory(inference.load(run, betas=experiment.betas(whole.config)), clip)[:frames]
-    body, root = body_trajectory(whole, clip)
-    return gltf.to_glb(out, garment, whole.garment.faces, body[:frames], whole.body.faces, root[:frames], clip.fps)
+def film(write: Callable) -> Callable:
+    """A writer of a performance from one of pictures and frames a second; the camera goes along, but does not bob."""
+
+    def written(out: Path, shown: Performance) -> None:
+        tracks = [np.asarray(part.vertices) + shown.root[:, None] * [0.0, 1.0, 0.0] for part in shown.parts]
+        floor, camera = float(tracks[0][..., 1].min()), animation.camera_for(shown.parts[0].vertices)
+        pictures = []
+        with progress("rendering", len(shown.root)) as report:
+            for t in range(len(shown.root)):
+                surfaces = [Surface(x[t], part.faces, part.colour) for x, part in zip(tracks, shown.parts)]
+                pictures.append(animation.render(surfaces, camera, SIZE, floor=floor))
+                report(t + 1)
+        write(out, pictures, shown.fps)
+
+    return written
 
 
-def write_comparison(run: Path, whole: Experiment, motion: str, out: Path, frames: int = 0) -> None:
+def write_comparison(run: Path, whole: Experiment, motion: str, out: Path) -> None:
     """Skinning, Phi, Psi and the reference solver at the same moments of a measured clip."""
     path = kept(run) / f"trajectories_{Path(motion).stem}.npz"
     if not path.is_file():
@@ -122,6 +128,18 @@ def dressed(whole: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Su
     """The surfaces of a garment on a body, or of the garment alone where the scene has no body."""
     cloth = [Surface(garment, whole.garment.faces)]
     return [Surface(body, whole.body.faces, SKIN), *cloth] if whole.scene.touchable else cloth
+
+
+WRITERS = {
+    ".webp": film(animation.webp),
+    ".mp4": film(animation.mp4),
+    ".glb": gltf.to_glb,
+    ".usdc": usd.to_usd,
+    ".usda": usd.to_usd,
+    ".pc2": point_cache.to_pc2,
+    ".mdd": point_cache.to_mdd,
+    ".obj": point_cache.to_obj,
+}
 
 
 if __name__ == "__main__":

@@ -1,3 +1,8 @@
+import json
+import shutil
+import struct
+import subprocess
+
 import numpy as np
 import pygltflib
 import pytest
@@ -6,7 +11,8 @@ from PIL import Image
 
 from clothjax import animation
 from clothjax.animation import Surface
-from clothjax.export import gltf
+from clothjax.export import gltf, point_cache, usd
+from clothjax.export.performance import Part, Performance
 
 
 def sheet(count: int = 12):
@@ -59,14 +65,21 @@ def test_comparison_and_webp_hold_every_picture(tmp_path):
     assert Image.open(tmp_path / "w.webp").n_frames == 4
 
 
-def test_glb_holds_the_animation(tmp_path):
+@pytest.fixture
+def flag():
+    """A waving sheet before a nearly still one, both moving along x."""
     vertices, faces = sheet()
     time = np.linspace(0, 2 * np.pi, 20)[:, None, None]
     waving = vertices + np.array([0, 0, 0.1]) * np.sin(time + 4 * vertices[:, :1])
     still = np.repeat(vertices[None] - [0, 0, 0.5], 20, axis=0) + 1e-3 * np.sin(time)
     root = np.stack([np.linspace(0, 1, 20), np.zeros(20), np.zeros(20)], -1)
-    path = tmp_path / "g.glb"
-    errors = gltf.to_glb(path, waving, faces, still, faces, root, 30.0)
+    parts = (Part("body", still, faces, animation.SKIN), Part("garment", waving, faces, animation.CLOTH))
+    return Performance(parts, root, 30.0)
+
+
+def test_glb_holds_the_animation(tmp_path, flag):
+    waving, path = flag.parts[1].vertices, tmp_path / "g.glb"
+    errors = gltf.to_glb(path, flag)
     assert max(errors.values()) <= 1e-3
     document = pygltflib.GLTF2().load(str(path))
     blob = document.binary_blob()
@@ -87,3 +100,87 @@ def test_glb_holds_the_animation(tmp_path):
     rebuilt = read(primitive.attributes.POSITION) + np.einsum("tk,kvc->tvc", weights, targets)
     np.testing.assert_allclose(rebuilt, waving, atol=1.1e-3)
     assert len(trimesh.load(path).geometry) == 2
+
+
+VALIDATE = """
+import { readFileSync } from "fs";
+import validator from "gltf-validator";
+const found = await validator.validateBytes(new Uint8Array(readFileSync(process.argv[2])));
+console.log(JSON.stringify(found.issues));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npm") is None, reason="needs Node")
+def test_the_khronos_validator_finds_nothing(tmp_path, flag):
+    subprocess.run(["npm", "install", "--silent", "gltf-validator"], check=True, cwd=tmp_path)
+    (tmp_path / "validate.mjs").write_text(VALIDATE)
+    gltf.to_glb(tmp_path / "g.glb", flag)
+    command = ["node", "validate.mjs", "g.glb"]
+    done = subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, text=True)
+    issues = json.loads(done.stdout)
+    assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"][:5]
+
+
+def test_usd_holds_the_animation(tmp_path, flag):
+    pytest.importorskip("pxr", reason="usd-core is not there for this Python")
+    from pxr import Usd, UsdGeom
+
+    for name in ("c.usdc", "c.usda"):
+        usd.to_usd(tmp_path / name, flag)
+        stage = Usd.Stage.Open(str(tmp_path / name))
+        assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 19, 30)
+        assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+        for part in flag.parts:
+            mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/character/{part.name}"))
+            assert UsdGeom.Mesh.ValidateTopology(
+                mesh.GetFaceVertexIndicesAttr().Get(), mesh.GetFaceVertexCountsAttr().Get(), part.vertices.shape[1]
+            )[0]
+            np.testing.assert_array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), part.faces)
+            for t in (0, 7, 19):
+                place = np.array(UsdGeom.XformCache(t).GetLocalToWorldTransform(mesh.GetPrim()))
+                points = np.array(mesh.GetPointsAttr().Get(t)) @ place[:3, :3] + place[3, :3]
+                np.testing.assert_allclose(points, flag.placed(part)[t], atol=1e-6)
+                normals = np.array(mesh.GetNormalsAttr().Get(t))
+                np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+                low, high = np.array(mesh.GetExtentAttr().Get(t))
+                np.testing.assert_allclose([low, high], [part.vertices[t].min(0), part.vertices[t].max(0)], atol=1e-6)
+
+
+def test_point_caches_hold_the_garment_in_the_world(tmp_path, flag):
+    expected = flag.placed(flag.parts[1])
+    count = expected.shape[1]
+    point_cache.to_pc2(tmp_path / "g.pc2", flag)
+    data = (tmp_path / "g.pc2").read_bytes()
+    assert struct.unpack("<12siiffi", data[:32]) == (b"POINTCACHE2\0", 1, count, 0.0, 1.0, 20)
+    np.testing.assert_array_equal(np.frombuffer(data[32:], "<f4").reshape(20, count, 3), expected)
+    point_cache.to_mdd(tmp_path / "g.mdd", flag)
+    data = (tmp_path / "g.mdd").read_bytes()
+    assert struct.unpack(">ii", data[:8]) == (20, count)
+    np.testing.assert_allclose(struct.unpack(">20f", data[8:88]), np.arange(20) / 30, rtol=1e-6)
+    np.testing.assert_array_equal(np.frombuffer(data[88:], ">f4").reshape(20, count, 3), expected)
+    mesh = trimesh.load(tmp_path / "g.obj", process=False)
+    np.testing.assert_allclose(mesh.vertices, expected[0], atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, flag.parts[1].faces)
+
+
+def test_obj_has_a_file_for_every_frame(tmp_path, flag):
+    point_cache.to_obj(tmp_path / "c.obj", flag)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"c_{t:04d}.obj" for t in range(20)]
+    scene = trimesh.load(tmp_path / "c_0007.obj", process=False, split_objects=True)
+    assert scene.geometry.keys() == {"body", "garment"}
+    for part in flag.parts:
+        np.testing.assert_allclose(scene.geometry[part.name].vertices, flag.placed(part)[7], atol=1e-6)
+
+
+def test_mp4_plays_what_was_drawn(tmp_path):
+    import av
+
+    pictures = [np.full((48, 64, 3), 20 * k, np.uint8) for k in range(12)]
+    animation.mp4(tmp_path / "f.mp4", pictures, 30.0)
+    with av.open(str(tmp_path / "f.mp4")) as film:
+        assert float(film.streams.video[0].average_rate) == 30
+        found = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(found) == 12
+    for picture, frame in zip(pictures, found, strict=True):
+        assert frame.shape == picture.shape and np.abs(frame.astype(int) - picture).max() <= 6

@@ -1,45 +1,21 @@
 """glTF: an animated garment on its body, as morph targets that any viewer plays. NumPy only."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from clothjax.animation import CLOTH, SKIN, vertex_normals
+from clothjax.animation import vertex_normals
+from clothjax.export.performance import Performance
 
 FLOAT, UNSIGNED = 5126, 5125
 POSITIONS, INDICES = 34962, 34963  # buffer targets
 
 
-class Part(NamedTuple):
-    """One mesh of the file."""
-
-    name: str
-    vertices: np.ndarray  # [T, N, 3] m, relative to the root
-    faces: np.ndarray  # [F, 3]
-    colour: tuple[float, float, float]
-
-
-def to_glb(
-    path: str | Path,
-    garment: np.ndarray,
-    garment_faces: np.ndarray,
-    body: np.ndarray,
-    body_faces: np.ndarray,
-    root: np.ndarray,
-    fps: float,
-    *,
-    tolerance: float = 1e-3,
-    most: int = 48,
-) -> dict[str, float]:
+def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-3, most: int = 48) -> dict[str, float]:
     """Writes a binary glTF; returns the largest error in m of each mesh.
 
     Shapes are compressed by principal components into morph targets: as many as keep every vertex within
     `tolerance` m, but at the most `most`.
-
-    Args:
-        garment: [T, V, 3] m, body: [T, B, 3] m, both relative to `root` [T, 3] m.
-        fps: frames a second.
 
     Raises:
         ImportError: if pygltflib is not installed.
@@ -49,14 +25,11 @@ def to_glb(
     except ImportError as error:
         raise ImportError("glTF needs pygltflib: pip install clothjax[render]") from error
     writer = _Buffer(gltf)
-    times = writer.add(np.arange(len(root), dtype=np.float32) / fps, "SCALAR", bounds=True)
-    parts = [
-        Part("body", np.asarray(body), body_faces, SKIN),
-        Part("garment", np.asarray(garment), garment_faces, CLOTH),
-    ]
+    frames = np.arange(len(performance.root), dtype=np.float32)
+    times = writer.add(frames / np.float32(performance.fps), "SCALAR", bounds=True)
     meshes, materials, nodes, channels, samplers, errors = [], [], [], [], [], {}
-    moved = writer.add(np.asarray(root, np.float32), "VEC3")
-    for index, part in enumerate(parts):
+    moved = writer.add(np.asarray(performance.root, np.float32), "VEC3")
+    for index, part in enumerate(performance.parts):
         mean, targets, weights, errors[part.name] = principal_components(part.vertices, tolerance, most)
         attributes = gltf.Attributes(
             POSITION=writer.add(mean, "VEC3", POSITIONS, bounds=True),
@@ -81,7 +54,7 @@ def to_glb(
             channels.append(gltf.AnimationChannel(sampler=len(samplers) - 1, target=target))
     document = gltf.GLTF2(
         scene=0,
-        scenes=[gltf.Scene(nodes=[0, 1])],
+        scenes=[gltf.Scene(nodes=list(range(len(nodes))))],
         nodes=nodes,
         meshes=meshes,
         materials=materials,

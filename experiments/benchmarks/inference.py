@@ -153,7 +153,10 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
         calls[f"on 4 000 vertices{kind}"] = onnx_call(onnx.to_onnx(fine, folder / "fine.onnx", int8=int8), fine)
     if psi_ffi.available():
         calls["jax: plain C inside"] = packed_call(folded)
+    shown = folding.part(folded, np.arange(folded.wearer.template.shape[1] // 2))
+    calls["jax: half of the vertices"] = jax_call(shown)
     if library:
+        calls["C: half of the vertices"] = c_call(library, native.to_c(shown, folder / "shown.psi"), shown)
         calls["C: off screen"] = c_call(library, native.to_c(folded, folder / "form.psi"), folded, vertices=False)
         calls["C: on 4 000 vertices"] = c_call(library, native.to_c(fine, folder / "fine.psi"), fine)
     calls["jax: off screen"] = jax_call(folded, vertices=False)
@@ -175,6 +178,10 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
         }
         | ({"c": worst["C: folded"]} if library else {}),
         "offscreen_ratio": us["jax: off screen"] / us["jax: folded"],
+        "skips": {
+            name: {run: us[f"{run}: {name}"] / us[f"{run}: folded"] for run in ("jax", "C") if f"{run}: {name}" in us}
+            for name in ("off screen", "half of the vertices")
+        },
         "level_of_detail_ratio": us["jax: folded"] / us["jax: on 4 000 vertices"],
         "shipped_us_all": us,
     }

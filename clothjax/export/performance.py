@@ -1,0 +1,26 @@
+"""Moving meshes, as animation programs take them: what `gltf`, `usd` and `point_cache` write."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Part(NamedTuple):
+    """One mesh."""
+
+    name: str
+    vertices: np.ndarray  # [T, N, 3] m, relative to the root
+    faces: np.ndarray  # [F, 3]
+    colour: tuple[float, float, float]
+
+
+class Performance(NamedTuple):
+    """A character over time; its garment is the last of the parts."""
+
+    parts: tuple[Part, ...]
+    root: np.ndarray  # [T, 3] m
+    fps: float
+
+    def placed(self, part: Part) -> np.ndarray:
+        """The vertices [T, N, 3] m of a part in the world, float32."""
+        return (np.asarray(part.vertices) + np.asarray(self.root)[:, None]).astype(np.float32)
