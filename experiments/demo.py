@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax import motion_matching, storage, trained
+from clothjax import metrics, motion_matching, storage, trained
 from clothjax.features import scaled, unscaled
 from clothjax.types import Material, Motion
 from experiments.live import STAGES, TURN, Show, finer, strain
@@ -29,7 +29,7 @@ WANDER = ("walk", "run", "arms")  # families that are for going about; others ar
 ACTION = 36  # frames, of what was asked for
 BETAS = 4  # sliders
 GRID = 2.0  # m, between the heavy lines of the floor
-STRAINED = 0.2  # that is drawn red
+STRAINED, DEEP = 0.2, 0.005  # strain, and m inside the body, that are drawn red
 COLOURS = {
     "body": (214, 178, 152), "psi": (58, 107, 184), "skinning": (150, 150, 150), "phi": (88, 150, 96),
     "solver": (196, 120, 60),
@@ -84,14 +84,15 @@ class Viewer:
             self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
             self.body = gui.add_checkbox("Body", True)
             self.wireframe = gui.add_checkbox("Wireframe", False)
-            self.strain = gui.add_checkbox("Strain", False, hint=f"points: blue at rest, red from {STRAINED:.0%}")
+            told = f"strain: red from {STRAINED:.0%}; penetration: red from {1e3 * DEEP:.0f} mm inside the body"
+            self.points = gui.add_dropdown("Points", ("none", "strain", "penetration"), hint=told)
             self.follow = gui.add_checkbox("Follow", True)
             self.pause = gui.add_checkbox("Pause", False)
             self._button("Single step", lambda: setattr(self, "_one_more", True))
         self.text = gui.add_markdown("")
         for control in (self.garment, self.fine, self.count, *self.betas, *self.material.values()):
             control.on_update(lambda _: setattr(self, "_dress_anew", True))
-        for control in (self.body, self.wireframe, self.strain, self.follow):
+        for control in (self.body, self.wireframe, self.points, self.follow):
             control.on_update(lambda _: setattr(self, "_draw_anew", True))
 
     def _button(self, label: str, act: Callable, hotkey: str | None = None, hint: str | None = None) -> None:
@@ -145,6 +146,8 @@ class Viewer:
         if self._shown is None:
             return
         garments, bodies = self._shown
+        others = [stage for stage in garments if stage != "psi"]
+        worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :]))
         here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
         drawn = set()
         with self.server.atomic():
@@ -153,10 +156,13 @@ class Viewer:
                 faces, rest = self.show.outfit.mesh(stage)
                 for i, vertices in enumerate(crowd):
                     drawn.add(self._mesh(f"/{stage}/{i}", vertices - here, faces, COLOURS[stage]))
-                if self.strain.value:
+                if self.points.value == "strain":
                     drawn.add(
                         self._points(f"/{stage}/strain", crowd[0] - here, strain(crowd[0], rest, faces) / STRAINED)
                     )
+                elif self.points.value == "penetration":
+                    depth, _ = metrics.penetration(crowd[0], worn_by[stage], self.show.body_faces)
+                    drawn.add(self._points(f"/{stage}/penetration", crowd[0] - here, depth / DEEP))
             for i, vertices in enumerate(bodies if self.body.value else []):
                 drawn.add(self._mesh(f"/body/{i}", vertices - here, self.show.body_faces, COLOURS["body"]))
             for name in set(self.meshes) - drawn:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import clothjax as cj
-from clothjax import features, motion_matching, rollout, skinning, storage, trained
+from clothjax import features, metrics, motion_matching, rollout, skinning, storage, trained
 from clothjax.config import MaterialConfig
 from clothjax.types import Material, Pose
 from experiments import demo, live
@@ -182,10 +182,22 @@ def test_the_panel_reaches_what_is_shown(viewer):
     viewer.run(1)
     large = skinning.shaped_vertices(storage.load_body("body"), jnp.asarray([2.0] + [0.0] * 9))
     np.testing.assert_allclose(viewer.show._shape[0], large, atol=1e-5)
-    viewer.strain.value = viewer.stages["skinning"].value = True
-    viewer.body.value = False
+    viewer.points.value, viewer.stages["skinning"].value, viewer.body.value = "strain", True, False
     viewer.run(2)
     assert set(viewer.meshes) == {"/psi/0", "/psi/strain", "/skinning/0", "/skinning/strain"}
+
+
+def test_what_is_inside_the_body_is_red(viewer):
+    viewer.points.value, viewer.stages["skinning"].value = "penetration", True
+    viewer.betas[0].value = 3.0
+    viewer.run(1)
+    inside = {}
+    for stage, body in zip(("psi", "skinning"), viewer._shown[1], strict=True):
+        depth, _ = metrics.penetration(viewer._shown[0][stage][0], body, viewer.show.body_faces)
+        red, _, blue = viewer.meshes[f"/{stage}/penetration"].colors.T.astype(int)
+        np.testing.assert_array_equal(red - blue > 0, depth > 0.5 * demo.DEEP)
+        inside[stage] = (depth > 0).mean()
+    assert inside["psi"] < inside["skinning"]
 
 
 def test_a_paused_show_waits_and_can_be_looked_at(viewer):

@@ -186,7 +186,8 @@ def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
 @pytest.mark.skipif(shutil.which("npm") is None, reason="needs Node")
 def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
     subprocess.run(["npm", "install", "--silent", "onnxruntime-web"], check=True, cwd=tmp_path)
-    shutil.copy(Path(convert.__file__).parent / "deploy" / "psi.mjs", tmp_path)
+    for name in ("psi.mjs", "garment.mjs"):
+        shutil.copy(Path(convert.__file__).parent / "deploy" / name, tmp_path)
     motion = convert.validation(model)
     rotations = np.asarray(motion.rotations).reshape(len(motion.rotations), -1)
     given = {"rotations": rotations.tolist(), "translation": motion.translation.tolist()}

@@ -1,0 +1,1 @@
+"""A page that plays garments in the browser alone."""

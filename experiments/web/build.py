@@ -1,0 +1,106 @@
+"""Builds a page that plays garments in the browser alone: no Python, and nothing but a file server, behind it.
+
+    python -m experiments.web.build --out site
+    python -m http.server --directory site          # and open the address that it prints
+
+ONNX Runtime Web (WebAssembly, or WebGPU: `?provider=webgpu`) moves the garments that come with the library, three.js
+skins the body on the GPU and draws. It needs Node with npm, which fetches what `package.json` names.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from clothjax import animation, folding, inference, storage, trained
+from clothjax.export import onnx
+from clothjax.types import Body
+from experiments.session import fail_clearly, progress, setup
+
+HERE = Path(__file__).parent
+SOURCES = ("package.json", "package-lock.json", "main.js", "index.html")
+MOTIONS = ("walk_3", "dance_3", "run_3", "jump_3", "twist_3", "arms_3")
+INFLUENCES = 4  # joints that move a vertex of the body: what GPU skinning takes
+
+
+def main(argv: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="a folder")
+    parser.add_argument("--garments", nargs="+", choices=trained.shipped(), default=trained.shipped())
+    parser.add_argument("--motions", nargs="+", default=MOTIONS, help="asset names or paths")
+    arguments = parser.parse_args(argv)
+    if shutil.which("npm") is None:
+        raise ValueError("npm is not on the path: install Node")
+    for folder in ("garments", "motions"):
+        (arguments.out / folder).mkdir(parents=True, exist_ok=True)
+    models = {name: inference.load(name) for name in arguments.garments}
+    first, *others = models.values()
+    if any(model.config.body != first.config.body for model in others):
+        raise ValueError(f"{', '.join(models)} are not all of one body: leave some out")
+    clips = {Path(name).stem: storage.load_motion(name, first.names) for name in arguments.motions}
+    with progress("exporting", len(models)) as report:
+        for index, (name, model) in enumerate(models.items()):
+            onnx.to_onnx(folding.specialise(model), arguments.out / "garments" / f"{name}.onnx", int8=True)
+            report(index + 1)
+    about = body(storage.load_body(first.config.body), arguments.out / "body.bin")
+    for name, clip in clips.items():
+        place = clip.translation - clip.translation[:1] * [1, 0, 1]
+        rows = np.concatenate([np.reshape(clip.rotations, (len(place), -1)), place], axis=1)
+        rows.astype("<f4").tofile(arguments.out / "motions" / f"{name}.bin")
+    about |= {"garments": list(arguments.garments), "motions": list(clips), "fps": first.config.fps}
+    about |= {"skin": animation.SKIN, "cloth": animation.CLOTH}
+    (arguments.out / "about.json").write_text(json.dumps(about))
+    bundle(arguments.out)
+    print(f"written to {arguments.out}: python -m http.server --directory {arguments.out}")
+
+
+def body(whole: Body, path: Path) -> dict:
+    """Writes the mean body for GPU skinning, and tells where in the file its arrays are."""
+    weights = np.asarray(whole.weights)
+    bones = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
+    kept = np.take_along_axis(weights, bones, axis=1)
+    arrays = {
+        "vertices": np.asarray(whole.vertices, "<f4"),
+        "weights": (kept / kept.sum(axis=1, keepdims=True)).astype("<f4"),
+        "faces": np.asarray(whole.faces, "<u4"),
+        "bones": bones.astype("<u2"),
+    }
+    path.write_bytes(b"".join(array.tobytes() for array in arrays.values()))
+    ends = np.cumsum([0, *(array.nbytes for array in arrays.values())])
+    places = {name: [int(at), array.size] for (name, array), at in zip(arrays.items(), ends)}
+    return {"body": places, "joints": np.asarray(whole.joints).tolist(), "parents": [int(p) for p in whole.parents]}
+
+
+def bundle(out: Path) -> None:
+    """The page's program with its libraries, by esbuild."""
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder) / "web"
+        work.mkdir()
+        for name in SOURCES:
+            shutil.copy(HERE / name, work)
+        shutil.copytree(HERE.parent / "deploy", Path(folder) / "deploy")
+        _run(["npm", "ci", "--silent"], work)
+        _run(
+            ["npx", "esbuild", "main.js", "--bundle", "--format=esm", "--minify", f"--outfile={out.resolve()}/main.js"],
+            work,
+        )
+        shutil.copy(HERE / "index.html", out)
+        for path in (work / "node_modules" / "onnxruntime-web" / "dist").glob("ort-wasm-simd-threaded*"):
+            shutil.copy(path, out)
+
+
+def _run(command: list[str], folder: Path) -> None:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"{' '.join(command)} failed: {(done.stderr or done.stdout).strip()}")
+
+
+if __name__ == "__main__":
+    setup()
+    with fail_clearly():
+        main(sys.argv[1:])
