@@ -15,6 +15,7 @@ from clothjax.types import Array, Garment, Motion, Pose
 
 WORTH = 0.75  # of the weights of the layers around the code, that folding it away must leave at the most
 CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # that tell which displacements occur
+UNSEEN = 1e-3  # of the mean variance of blend-shape weights: that of those that do not vary there
 SAMPLES = 2048  # codes that do, where these do not fit
 
 
@@ -152,12 +153,16 @@ def _fewer_shapes(model: Model, count: int) -> Model:
     template."""
     network, weights = model.network, ordinary_weights(model).astype(np.float64)
     mean, spread = weights.mean(axis=0), np.cov(weights.T)
-    root = np.linalg.cholesky(spread + 1e-9 * np.trace(spread) / len(mean) * np.eye(len(mean)))
+    root = np.linalg.cholesky(spread + UNSEEN * np.trace(spread) / len(mean) * np.eye(len(mean)))
     # weights are mean + u root^T with isotropic u: the rows that serve u best are principal in root^T shapes
     unmixed = root.T @ np.asarray(network.shapes, np.float64)
     chosen = np.linalg.eigh(unmixed @ unmixed.T)[1][:, -count:]
-    mixing = np.linalg.solve(root.T, chosen)
-    network = network._replace(shapes=jnp.asarray(chosen.T @ unmixed, jnp.float32))
+    # in coordinates that are not large and cancelled by others: eight bits could not hold these
+    turned, upper = np.linalg.qr(np.linalg.solve(root.T, chosen))
+    rows = upper @ chosen.T @ unmixed
+    axes = np.linalg.eigh(rows @ rows.T)[1]
+    mixing = turned @ axes
+    network = network._replace(shapes=jnp.asarray(axes.T @ rows, jnp.float32))
     mix = Layer(jnp.asarray(mixing, jnp.float32), _product(-mean, mixing))
     template = model.wearer.template + _product(mean, model.network.shapes).reshape(3, -1)
     if model.config.model.blendshape_relu:

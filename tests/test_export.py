@@ -96,7 +96,7 @@ def test_int8_is_small_and_near(model, motion, tmp_path):
     eight = onnx.to_onnx(model, tmp_path / "e.onnx", int8=True)
     assert eight.stat().st_size < 0.3 * whole.stat().st_size
     error = apart(onnx.run_onnx(eight, model, motion), model, motion)
-    assert error.max() < 4e-3 and error.mean() < 1e-3
+    assert error.max() < 2e-3 and error.mean() < 4e-4
     assert error.mean() > 1e-6
 
 
@@ -179,7 +179,7 @@ def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
     path = onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
     done = subprocess.run([python, "-c", OLD, path, given, found], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "1.15.1" and len(np.load(found)) == 300
-    assert apart(np.load(found), model, motion).max() < (4e-3 if int8 else 1e-4)
+    assert apart(np.load(found), model, motion).max() < (2e-3 if int8 else 1e-4)
 
 
 @pytest.mark.slow
@@ -192,7 +192,7 @@ def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
     rotations = np.asarray(motion.rotations).reshape(len(motion.rotations), -1)
     given = {"rotations": rotations.tolist(), "translation": motion.translation.tolist()}
     (tmp_path / "motion.json").write_text(json.dumps(given))
-    for int8, most in ((False, 1e-4), (True, 4e-3)):
+    for int8, most in ((False, 1e-4), (True, 2e-3)):
         onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
         command = ["node", "psi.mjs", "g.onnx", "motion.json", "vertices.bin"]
         done = subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, text=True)
@@ -221,7 +221,7 @@ def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
     motion = convert.validation(model)
     rows = [np.asarray(x, np.float32).reshape(300, -1) for x in (motion.rotations, motion.translation)]
     np.concatenate(rows, axis=1).tofile(tmp_path / "motion.bin")
-    for int8, most in ((False, 1e-4), (True, 4e-3)):
+    for int8, most in ((False, 1e-4), (True, 2e-3)):
         onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
         command = [program, tmp_path / "g.onnx", tmp_path / "motion.bin", tmp_path / "vertices.bin"]
         done = subprocess.run(command, check=True, capture_output=True, text=True)

@@ -11,6 +11,7 @@ from toy import small
 
 import clothjax as cj
 from clothjax import blendshapes, experiment, folding, garment_model, inference, latent_predictor, skinning, storage
+from clothjax.export import native
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import Motion
 
@@ -171,3 +172,17 @@ def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
     fine = folding.on_mesh(model, garment, np.zeros(10))
     still = np.abs(np.asarray(fine.network.shapes).reshape(len(fine.network.shapes), 3, -1)).max(axis=(0, 1)) == 0
     np.testing.assert_array_equal(still, garment.pinned)
+
+
+def test_fewer_shapes_bear_eight_bits():
+    """Their coordinates do not cancel each other: rounding them does not hurt more than leaving shapes out."""
+    model = inference.load("skirt")
+    clip = storage.load_motion("walk_3", model.names)
+    motion = Motion(clip.rotations[:60], clip.translation[:60].astype(np.float32), clip.fps)
+    for count in (192, 64):
+        few = folding.specialise(model, blendshapes=count)
+        matrix, gain, scale = native.eight_bits(few.network.read.kernel, True)
+        rounded = few.network.read._replace(kernel=jnp.asarray((scale[:, None] * matrix * gain).T))
+        coarse = dataclasses.replace(few, network=few.network._replace(read=rounded))
+        apart = inference.animate(few, motion)[0] - inference.animate(coarse, motion)[0]
+        assert jnp.linalg.norm(apart, axis=-1).mean() < 5e-4, count

@@ -225,8 +225,7 @@ def shape_weights(g: Graph, latent: str, model: Model) -> str:
         whole = len(network.first)
         read = g("Add", g.slice(latent, 1, whole - size, whole), network.read.bias)
     else:
-        bounds = network.code_bounds
-        read = g.even(latent, np.maximum(-np.asarray(bounds.low), np.asarray(bounds.high)), network.read)
+        read = g.twice(latent, network.read)
     x = read if size == wide else g.slice(read, 1, 0, wide)
     for layer in network.decoder:
         x = g.layer(g("Relu", x), layer)

@@ -61,9 +61,23 @@ class Graph:
     def layer(self, x: str, layer: Layer) -> str:
         return self("Add", self.product(x, layer.kernel), layer.bias)
 
-    def product(self, x: str, kernel: Array) -> str:
+    def product(self, x: str, kernel: str | Array) -> str:
         """A dense layer without a bias."""
-        return self("MatMul", x, np.asarray(kernel), name=f"dense_{len(self.nodes)}")
+        return self("MatMul", x, kernel, name=f"dense_{len(self.nodes)}")
+
+    def twice(self, x: str, layer: Layer) -> str:
+        """`layer`; where matrices have eight bits, of inputs in eight bits and of what these leave, in eight again. So
+        the inputs can take over all of what makes a column of weights smaller than others."""
+        if not self.int8:
+            return self.layer(x, layer)
+        gain = np.maximum(np.abs(np.asarray(layer.kernel)).max(axis=1), 1e-6)
+        x, kernel = self("Mul", x, gain), self.constant(np.asarray(layer.kernel) / gain[:, None])
+        quantised = f"quantised_{len(self.nodes)}"
+        names = [quantised, f"{quantised}_scale", f"{quantised}_zero"]
+        self.nodes.append(self.onnx.helper.make_node("DynamicQuantizeLinear", [x], names, name=quantised))
+        held = self("DequantizeLinear", *names)
+        left = self("Sub", x, held)
+        return self("Add", self("Add", self.product(held, kernel), self.product(left, kernel)), layer.bias)
 
     def even(self, x: str, limits: Array, layer: Layer) -> str:
         """`layer` of inputs within +-`limits`, both scaled so that no input is small beside the others (Xiao et al.

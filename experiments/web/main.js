@@ -24,9 +24,10 @@ const about = await fetched("about.json", "json");
 const renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
 document.body.append(renderer.domElement);
 const scene = new THREE.Scene();
-scene.background = new THREE.Color(0.97, 0.975, 0.98);
-scene.add(new THREE.HemisphereLight(0xffffff, 0xb8b0a8, 1.6));
-const sun = new THREE.DirectionalLight(0xffffff, 2.2);
+const colour = (rgb) => new THREE.Color().setRGB(...rgb, THREE.SRGBColorSpace);
+scene.background = colour([0.97, 0.975, 0.98]);
+scene.add(new THREE.HemisphereLight(0xffffff, 0xb8b0a8, 1.8));
+const sun = new THREE.DirectionalLight(0xffffff, 2.0);
 sun.position.set(0.45, 0.8, 0.55);
 scene.add(sun, new THREE.GridHelper(20, 40, 0xc0c0c0, 0xdddddd));
 const camera = new THREE.PerspectiveCamera(30, 1, 0.05, 60);
@@ -68,7 +69,7 @@ shape.setAttribute("skinIndex", new THREE.BufferAttribute(part(Uint16Array, "bon
 shape.setAttribute("skinWeight", new THREE.BufferAttribute(part(Float32Array, "weights"), 4));
 shape.setIndex(new THREE.BufferAttribute(part(Uint32Array, "faces"), 1));
 shape.computeVertexNormals();
-const body = new THREE.SkinnedMesh(shape, new THREE.MeshLambertMaterial({ color: new THREE.Color(...about.skin) }));
+const body = new THREE.SkinnedMesh(shape, new THREE.MeshLambertMaterial({ color: colour(about.skin) }));
 body.frustumCulled = false;
 body.add(bones[0]);
 body.updateMatrixWorld(true);
@@ -86,10 +87,9 @@ function pose(rotations, translation) {
 
 // --- the garment ----------------------------------------------------------------------------------------------------
 
-const colour = new THREE.Color(...about.cloth);
 const cloth = new THREE.Mesh(
   new THREE.BufferGeometry(),
-  new THREE.MeshLambertMaterial({ color: colour, side: THREE.DoubleSide }),
+  new THREE.MeshLambertMaterial({ color: colour(about.cloth), side: THREE.DoubleSide }),
 );
 cloth.frustumCulled = false;
 scene.add(cloth);
