@@ -59,7 +59,7 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
     variants = {each["name"]: each for each in figures["variants"]}
     assert len(variants) >= 12 and all(each["us"] > 0 for each in variants.values())
     assert variants["folded"]["error_mm"] < 1e-3 < variants["folded, int8"]["error_mm"] < 1.0
-    assert variants["192 shapes"]["error_mm"] < variants["32 shapes"]["error_mm"]
+    assert variants["half of the shapes"]["error_mm"] < variants["a twelfth of the shapes"]["error_mm"]
     assert variants["folded, int8"]["bytes"] < 0.3 * variants["folded"]["bytes"]
     assert figures["shipped_us"] == variants[figures["shipped_form"]]["us"]
     us = figures["paper_us"]

@@ -123,7 +123,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     reference = np.asarray(inference.animate(model, motion)[0])
     forms = {"plain": model, "folded": folding.specialise(model)}
     forms |= _fewer(model)
-    forms |= {f"{count} shapes": folding.specialise(model, blendshapes=count) for count in (192, 32)}
+    forms["half of the shapes"] = folding.specialise(model, blendshapes=len(model.network.shapes) // 2)
     forms["4 influences"] = folding.specialise(model, max_influences=4)
     library = _library(folder)
     calls, found = {}, {}
@@ -294,7 +294,7 @@ def _pose(model: Model) -> Pose:
 
 
 def _fewer(model: Model) -> dict[str, Model]:
-    parts = {"three quarters": 0.75, "a third": 1 / 3, "a sixth": 1 / 6}
+    parts = {"three quarters": 3 / 4, "a third": 1 / 3, "a sixth": 1 / 6, "a twelfth": 1 / 12}
     count = len(model.network.shapes)
     return {f"{name} of the shapes": folding.specialise(model, blendshapes=int(x * count)) for name, x in parts.items()}
 
