@@ -139,40 +139,48 @@ async function next() {
 
 // --- running --------------------------------------------------------------------------------------------------------
 
+addEventListener("unhandledrejection", (event) => (element("time").value = event.reason.message));
+const wanted = []; // changes of garment and motion, for between two frames
 for (const [id, names, change] of [
   ["garment", about.garments, wear],
   ["motion", about.motions, play],
 ]) {
   element(id).append(...names.map((name) => new Option(name, name)));
   element(id).value = names.includes(asked.get(id)) ? asked.get(id) : names[0];
-  element(id).onchange = () => (wanted = () => change(element(id).value));
+  element(id).onchange = () => wanted.push(() => change(element(id).value));
   await change(element(id).value);
 }
 element("wireframe").onchange = () => (cloth.material.wireframe = element("wireframe").checked);
 
-let wanted = null, steps = 0, due = performance.now(), goes = new THREE.Vector3();
+let steps = 0;
+let due = performance.now();
 const last = Number(asked.get("frames") ?? Infinity);
 const still = () => element("pause").checked || steps >= last;
 
+function tell() {
+  const sorted = milliseconds.slice(-120).sort((a, b) => a - b);
+  const vertices = cloth.geometry.attributes.position.array;
+  window.clothjax = { steps, milliseconds: sorted[sorted.length >> 1], finite: vertices.every(Number.isFinite) };
+  element("time").value = `${window.clothjax.milliseconds.toFixed(2)} ms a frame of garment, ${providers[0]}`;
+}
+
+// The camera goes along with the character.
+function follow() {
+  const { x, z } = bones[0].position;
+  const step = new THREE.Vector3(x, controls.target.y, z).sub(controls.target).multiplyScalar(0.2);
+  camera.position.add(step);
+  controls.target.add(step);
+}
+
 async function draw(now) {
-  if (wanted) {
-    const change = wanted;
-    wanted = null;
-    await change();
-  }
-  if (!still() && (asked.has("fast") || now >= due)) {
+  const changed = wanted.length > 0;
+  while (wanted.length) await wanted.shift()();
+  if (changed || (!still() && (asked.has("fast") || now >= due))) {
     await next();
     steps += 1;
     due = Math.max(due + 1000 / about.fps, now - 100);
-    const sorted = milliseconds.slice(-120).sort((a, b) => a - b);
-    window.clothjax = { steps, milliseconds: sorted[sorted.length >> 1], finite: cloth.geometry.attributes.position.array.every(Number.isFinite) };
-    element("time").value = `${clothjax.milliseconds.toFixed(2)} ms a frame of garment, ${providers[0]}`;
-    if (!asked.has("camera")) {
-      // the camera goes along
-      const step = goes.set(bones[0].position.x, controls.target.y, bones[0].position.z).sub(controls.target).multiplyScalar(0.2);
-      camera.position.add(step);
-      controls.target.add(step);
-    }
+    tell();
+    if (!asked.has("camera")) follow();
   }
   controls.update();
   renderer.render(scene, camera);
