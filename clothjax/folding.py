@@ -70,6 +70,42 @@ def without_code(model: Model) -> Model:
     return dataclasses.replace(model, network=network)
 
 
+def evened(model: Model) -> Model:
+    """The same model with its code and its blend shapes scaled so that no input of the layers that read them is small
+    beside the others (Xiao et al. 2023): for runtimes that quantise all inputs of a layer alike."""
+    network = model.network
+    largest = np.abs(ordinary_weights(model)).max(axis=0)
+    of_shapes = _evening(largest, network.shapes)
+    *decoder, last = network.decoder
+    wide, mix, read = len(network.decoder[0].kernel), network.mix, network.read
+    if mix is not None:
+        mix = Layer(mix.kernel / of_shapes[None], mix.bias / of_shapes)
+    else:
+        last = Layer(last.kernel / of_shapes[None], last.bias / of_shapes)
+        beside = np.concatenate([np.ones(wide), of_shapes])[: len(read.bias)]
+        read = Layer(None if read.kernel is None else read.kernel / beside[None], read.bias / beside)
+    network = network._replace(decoder=(*decoder, last), mix=mix, read=read, shapes=network.shapes * of_shapes[:, None])
+    if network.code.kernel is not None:
+        bounds = network.code_bounds
+        limits = np.maximum(-np.asarray(bounds.low), np.asarray(bounds.high))
+        scale = _evening(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
+        *hidden, final = network.hidden
+        network = network._replace(
+            code=network.code._replace(kernel=network.code.kernel * scale[:, None]),
+            read=read._replace(kernel=read.kernel * scale[:, None]),
+            hidden=(*hidden, Layer(final.kernel / scale[None], final.bias / scale)),
+            code_bounds=Bounds(*(row / scale for row in bounds)),
+            first=network.first / scale,
+        )
+    return dataclasses.replace(model, network=network)
+
+
+def _evening(limits: Array, kernel: Array) -> np.ndarray:
+    """What inputs [n] are to be divided by, that reach to `limits`, and the rows of their kernel [n, m] multiplied."""
+    weights = np.abs(np.asarray(kernel)).max(axis=1)
+    return np.sqrt(np.maximum(limits, 1e-6) / np.maximum(weights, 1e-6)).astype(np.float32)
+
+
 def part(model: Model, vertices: Array) -> Model:
     """The model of some vertices [n] of its garment, as those that are not hidden; of its faces those they make up."""
     vertices = np.unique(np.asarray(vertices))

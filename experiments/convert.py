@@ -73,6 +73,8 @@ def _batch(given: str) -> int | None:
 def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
     """Writes the file and its JSON, and says how far it is from the model."""
     small = folding.specialise(model, blendshapes=arguments.blendshapes, max_influences=arguments.max_influences)
+    if arguments.to == "litert" and arguments.int8:
+        small = folding.evened(small)
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
     motion = validation(model)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -186,3 +186,19 @@ def test_fewer_shapes_bear_eight_bits():
         coarse = dataclasses.replace(few, network=few.network._replace(read=rounded))
         apart = inference.animate(few, motion)[0] - inference.animate(coarse, motion)[0]
         assert jnp.linalg.norm(apart, axis=-1).mean() < 5e-4, count
+
+
+def test_an_evened_model_is_the_same(wide, motion):
+    clip = motion._replace(rotations=motion.rotations[:100], translation=motion.translation[:100])
+    for model in (
+        cj.load("skirt"),
+        folding.specialise(cj.load("skirt"), blendshapes=50),
+        wide,
+        folding.specialise(wide),
+    ):
+        even = folding.evened(model)
+        one, other = (inference.animate(each, clip)[0] for each in (model, even))
+        np.testing.assert_allclose(one, other, atol=3e-5)
+        reach = np.abs(folding.ordinary_weights(even)).max(axis=0)
+        rows = np.abs(np.asarray(even.network.shapes)).max(axis=1)
+        np.testing.assert_allclose(reach, rows, rtol=1e-2, atol=1e-3)
