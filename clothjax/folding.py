@@ -84,19 +84,25 @@ def evened(model: Model) -> Model:
         last = Layer(last.kernel / of_shapes[None], last.bias / of_shapes)
         beside = np.concatenate([np.ones(wide), of_shapes])[: len(read.bias)]
         read = Layer(None if read.kernel is None else read.kernel / beside[None], read.bias / beside)
-    network = network._replace(decoder=(*decoder, last), mix=mix, read=read, shapes=network.shapes * of_shapes[:, None])
-    if network.code.kernel is not None:
-        bounds = network.code_bounds
-        limits = np.maximum(-np.asarray(bounds.low), np.asarray(bounds.high))
+    if network.code.kernel is None:  # the code is what the readers make of it: here of `read`, at its end
+        scale = np.ones(len(network.first), np.float32)
+        if mix is None:
+            scale[-len(read.bias) :] = beside
+    else:
+        limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
         scale = _evening(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
-        *hidden, final = network.hidden
-        network = network._replace(
-            code=network.code._replace(kernel=network.code.kernel * scale[:, None]),
-            read=read._replace(kernel=read.kernel * scale[:, None]),
-            hidden=(*hidden, Layer(final.kernel / scale[None], final.bias / scale)),
-            code_bounds=Bounds(*(row / scale for row in bounds)),
-            first=network.first / scale,
-        )
+        read = read._replace(kernel=read.kernel * scale[:, None])
+        network = network._replace(code=network.code._replace(kernel=network.code.kernel * scale[:, None]))
+    *hidden, final = network.hidden
+    network = network._replace(
+        hidden=(*hidden, Layer(final.kernel / scale[None], final.bias / scale)),
+        code_bounds=Bounds(*(row / scale for row in network.code_bounds)),
+        first=network.first / scale,
+        read=read,
+        decoder=(*decoder, last),
+        mix=mix,
+        shapes=network.shapes * of_shapes[:, None],
+    )
     return dataclasses.replace(model, network=network)
 
 

@@ -27,18 +27,20 @@ def init_dense(key: Array, inputs: int, outputs: int, gain: float = 2.0) -> Para
 
 
 def dense(params: Params, x: Array) -> Array:
-    """A dense layer on [..., inputs], in the kernel's precision."""
-    kernel = params["kernel"]
-    return nn.Dense(kernel.shape[-1], dtype=kernel.dtype).apply({"params": params}, x).astype(x.dtype)
+    """A dense layer on [..., inputs]."""
+    bias = params["bias"]
+    return _times(x, params["kernel"]) + bias.reshape((1,) * (x.ndim - 1) + bias.shape)
 
 
 def _times(x: Array, kernel: Array) -> Array:
-    """x [..., inputs] times a kernel [inputs, outputs] in the kernel's precision, given in that of x."""
-    return (x.astype(kernel.dtype) @ kernel).astype(x.dtype)
+    """x [..., inputs] times a kernel [inputs, outputs]; where that is in bfloat16, so is the product."""
+    if kernel.dtype == jnp.bfloat16:
+        return (x.astype(jnp.bfloat16) @ kernel).astype(x.dtype)
+    return x @ kernel
 
 
 def in_bfloat16(params: Params) -> Params:
-    """The same layers with their kernels in bfloat16, so that products are, and their gradients; nothing else is."""
+    """The same layers with their kernels in bfloat16, so that products are, and the gradients of these."""
 
     def rounded(path, leaf):
         return leaf.astype(jnp.bfloat16) if path[-1] == jax.tree_util.DictKey("kernel") else leaf

@@ -6,7 +6,8 @@
     python -m experiments.render --pretrained skirt --motion dance_3 --out skirt.usdc
 
 Psi on the body as a film (.webp, .mp4); for a viewer or an animation program with both as meshes (.glb, .usdc, .usda,
-or .obj, one file a frame) or the garment's vertices alone (.pc2, .mdd, with an .obj of the mesh to put them on). .png
+or .obj, of which each frame is a file of its own) or the garment's vertices alone (.pc2, .mdd, with an .obj of the mesh
+to put them on). .png
 compares skinning, Phi, Psi and the reference solver on a clip that `experiments.evaluate` has measured.
 """
 
@@ -54,7 +55,8 @@ def main(argv: list[str]) -> None:
         write_comparison(run, whole, motion, arguments.out)
     else:
         WRITERS[kind](arguments.out, perform(run, whole, motion, frames))
-    print(f"written to {arguments.out}")
+    out = arguments.out
+    print(f"written to {out.with_name(f'{out.stem}_NNNN.obj') if kind == '.obj' else out}")
 
 
 def perform(run: Path, whole: Experiment, motion: str, frames: int) -> Performance:

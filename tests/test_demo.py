@@ -70,6 +70,7 @@ def test_stages_beside_each_other_wear_the_same_skirt(clips):
         for i, stage in enumerate(show.stages):
             apart = np.linalg.norm(garments[stage][0] - [i * live.APART, 0, 0] - garments["psi"][0], axis=-1)
             assert apart[pinned].max() < 1e-3, (t, stage)
+            # in a turn the solver's skirt is 6 cm from Psi's in the mean; in another frame it would be metres off
             assert apart.max() < 0.3 and (apart.mean() < 0.1 or stage == "skinning"), (t, stage)
     faces, rest = show.outfit.mesh("phi")
     assert faces.shape == show.outfit.mesh("psi")[0].shape
@@ -195,7 +196,8 @@ def test_what_is_inside_the_body_is_red(viewer):
     for stage, body in zip(("psi", "skinning"), viewer._shown[1], strict=True):
         depth, _ = metrics.penetration(viewer._shown[0][stage][0], body, viewer.show.body_faces)
         red, _, blue = viewer.meshes[f"/{stage}/penetration"].colors.T.astype(int)
-        np.testing.assert_array_equal(red - blue > 0, depth > 0.5 * demo.DEEP)
+        clear = np.abs(depth / demo.DEEP - 0.5) > 0.01  # colours are rounded
+        np.testing.assert_array_equal((red > blue)[clear], (depth > 0.5 * demo.DEEP)[clear])
         inside[stage] = (depth > 0).mean()
     assert inside["psi"] < inside["skinning"]
 

@@ -28,10 +28,15 @@ def motion():
 @pytest.fixture(scope="module")
 def wide():
     """A random model of the thesis's form: a wide code, a ReLU on the weights, no skip."""
+    return random_model(skip=False)
+
+
+def random_model(skip):
+    """A random model with a wide code, and either a skip or a ReLU on the weights."""
     config = small()
     config = dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, decoder=(24,), decoder_skip=False, blendshape_relu=True),
+        model=dataclasses.replace(config.model, decoder=(24,), decoder_skip=skip, blendshape_relu=not skip),
         stage2=dataclasses.replace(config.stage2, hidden=(32, 32), latent_decay=0.3),
     )
     whole = experiment.assemble(config)
@@ -190,12 +195,10 @@ def test_fewer_shapes_bear_eight_bits():
 
 def test_an_evened_model_is_the_same(wide, motion):
     clip = motion._replace(rotations=motion.rotations[:100], translation=motion.translation[:100])
-    for model in (
-        cj.load("skirt"),
-        folding.specialise(cj.load("skirt"), blendshapes=50),
-        wide,
-        folding.specialise(wide),
-    ):
+    beside = random_model(skip=True)
+    folded = [folding.specialise(each) for each in (wide, beside)]
+    assert all(each.network.code.kernel is None for each in folded)
+    for model in (cj.load("skirt"), folding.specialise(cj.load("skirt"), blendshapes=50), wide, beside, *folded):
         even = folding.evened(model)
         one, other = (inference.animate(each, clip)[0] for each in (model, even))
         np.testing.assert_allclose(one, other, atol=3e-5)

@@ -60,7 +60,7 @@ def _partly_quantised(model: Model) -> Callable:
     what is added to them is nothing. In eight bits they err by millimetres, for all inputs of a layer share a scale."""
 
     def hidden(latent: Array, *others: Array) -> tuple:
-        nothing = jnp.minimum(jnp.abs(latent[0]), 0.0)
+        nothing = jnp.where(jnp.abs(latent[0]) < 0.0, 1.0, 0.0)  # also of NaN
         network = model.network._replace(pose=model.network.pose + nothing, weights=model.network.weights + nothing)
         return frame.function(dataclasses.replace(model, network=network))(latent, *others)
 

@@ -121,18 +121,18 @@ def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
         OSError: if there is no compiler, or it fails.
     """
     library = Path(directory) / "libpsi.so"
-    compiled(compiler(), [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
+    compiled(compiler(), "C", [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
     return library
 
 
-def compiled(program: str | None, arguments: list[str | Path]) -> None:
+def compiled(program: str | None, language: str, arguments: list[str | Path]) -> None:
     """A compiler has done as it was told.
 
     Raises:
         OSError: if there is none, or it fails.
     """
     if program is None:
-        raise OSError("no compiler on the path: install gcc or clang")
+        raise OSError(f"no compiler for {language} on the path: install gcc or clang")
     command = [program, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:

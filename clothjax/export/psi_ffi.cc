@@ -1,4 +1,4 @@
-// psi.c as a function that XLA calls: see jitted.py.
+// psi.c as a function that XLA calls: see psi_ffi.py.
 #include "psi.h"
 #include "xla/ffi/api/ffi.h"
 

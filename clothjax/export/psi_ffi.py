@@ -34,8 +34,8 @@ class Packed:
 
 
 def available() -> bool:
-    """Whether there are the compilers."""
-    return None not in (native.compiler(), _compiler())
+    """Whether jax computes on a CPU, and there are the compilers."""
+    return jax.default_backend() == "cpu" and None not in (native.compiler(), _compiler())
 
 
 def _compiler() -> str | None:
@@ -43,11 +43,13 @@ def _compiler() -> str | None:
 
 
 def pack(model: Model) -> Packed:
-    """A model for `step`, best a specialised one: one wearer's, on a CPU.
+    """A model for `step`, best a specialised one: one wearer's.
 
     Raises:
-        OSError: if a compiler is missing, or fails.
+        OSError: if jax does not compute on a CPU, or a compiler is missing or fails.
     """
+    if jax.default_backend() != "cpu":
+        raise OSError(f"plain C inside of jax is for CPUs; jax computes on {jax.default_backend()} (JAX_PLATFORMS=cpu)")
     _register()
     return Packed(jnp.asarray(np.frombuffer(native.packed(model), np.uint8)), model.wearer.template.shape[1])
 
@@ -56,10 +58,10 @@ def pack(model: Model) -> Packed:
 def _register() -> None:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         plain, library = Path(folder) / "psi.o", Path(folder) / "libpsi_ffi.so"
-        native.compiled(native.compiler(), [*native.FLAGS, "-fPIC", "-c", native.SOURCES[1], "-o", plain])
+        native.compiled(native.compiler(), "C", [*native.FLAGS, "-fPIC", "-c", native.SOURCES[1], "-o", plain])
         includes = [f"-I{folder}" for folder in (native.SOURCES[0].parent, jax.ffi.include_dir())]
         shared = ["-std=c++17", "-O2", "-fPIC", "-shared", *includes, SOURCE, plain, "-o", library]
-        native.compiled(_compiler(), shared)
+        native.compiled(_compiler(), "C++", shared)
         handler = ctypes.CDLL(str(library)).PsiStep  # it stays loaded when its file is gone
     jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
 

@@ -43,6 +43,11 @@ def main(argv: list[str]) -> None:
     if any(model.config.body != first.config.body for model in others):
         raise ValueError(f"{', '.join(models)} are not all of one body: leave some out")
     clips = {Path(name).stem: storage.load_motion(name, first.names) for name in arguments.motions}
+    if len(clips) < len(arguments.motions):
+        raise ValueError(f"two motions have one name: {', '.join(arguments.motions)}; rename one")
+    for name, given in (clips | {name: model.config for name, model in models.items()}).items():
+        if abs(given.fps - first.config.fps) > 1e-3:
+            raise ValueError(f"{name} has {given.fps} frames a second, {next(iter(models))} {first.config.fps}")
     with progress("exporting", len(models)) as report:
         for index, (name, model) in enumerate(models.items()):
             onnx.to_onnx(folding.specialise(model), arguments.out / "garments" / f"{name}.onnx", int8=True)
@@ -95,7 +100,7 @@ def bundle(out: Path) -> None:
 
 
 def _run(command: list[str], folder: Path) -> None:
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    done = subprocess.run([shutil.which(command[0]), *command[1:]], cwd=folder, capture_output=True, text=True)
     if done.returncode:
         raise ValueError(f"{' '.join(command)} failed: {(done.stderr or done.stdout).strip()}")
 

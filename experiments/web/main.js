@@ -16,6 +16,10 @@ const fetched = async (path, kind) => {
   return answer[kind]();
 };
 
+const fail = (problem) => (element("time").value = problem?.message ?? String(problem));
+addEventListener("error", (event) => fail(event.error ?? event.message));
+addEventListener("unhandledrejection", (event) => fail(event.reason));
+
 ort.env.wasm.numThreads = 1;
 const about = await fetched("about.json", "json");
 
@@ -93,13 +97,15 @@ const cloth = new THREE.Mesh(
 );
 cloth.frustumCulled = false;
 scene.add(cloth);
-const providers = asked.get("provider") === "webgpu" && navigator.gpu ? ["webgpu", "wasm"] : ["wasm"];
+const webgpu = asked.get("provider") === "webgpu" && (await navigator.gpu?.requestAdapter());
+const providers = webgpu ? ["webgpu", "wasm"] : ["wasm"];
 let garment, clip, frame, milliseconds;
 
 async function wear(name) {
   const told = await fetched(`garments/${name}.json`, "json");
   const model = new Uint8Array(await fetched(`garments/${name}.onnx`, "arrayBuffer"));
   const session = await ort.InferenceSession.create(model, { executionProviders: providers });
+  await garment?.session.release();
   garment = new Garment(ort, session, told);
   cloth.geometry.dispose();
   cloth.geometry = new THREE.BufferGeometry();
@@ -139,7 +145,6 @@ async function next() {
 
 // --- running --------------------------------------------------------------------------------------------------------
 
-addEventListener("unhandledrejection", (event) => (element("time").value = event.reason.message));
 const wanted = []; // changes of garment and motion, for between two frames
 for (const [id, names, change] of [
   ["garment", about.garments, wear],
@@ -172,7 +177,7 @@ function follow() {
   controls.target.add(step);
 }
 
-async function draw(now) {
+async function advance(now) {
   const changed = wanted.length > 0;
   while (wanted.length) await wanted.shift()();
   if (changed || (!still() && (asked.has("fast") || now >= due))) {
@@ -182,6 +187,10 @@ async function draw(now) {
     tell();
     if (!asked.has("camera")) follow();
   }
+}
+
+async function draw(now) {
+  await advance(now).catch(fail);
   controls.update();
   renderer.render(scene, camera);
   requestAnimationFrame(draw);
