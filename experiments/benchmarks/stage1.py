@@ -98,8 +98,8 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
 
 def _apart(one: Params, other: Params) -> float:
     """The norm of the difference of two gradients, over that of the second."""
-    difference = optax.global_norm(jax.tree.map(jnp.subtract, one, other))
-    return float(difference / optax.global_norm(other))
+    difference = optax.tree.norm(jax.tree.map(jnp.subtract, one, other))
+    return float(difference / optax.tree.norm(other))
 
 
 def convolution(whole: Experiment, rounds: int) -> dict:
