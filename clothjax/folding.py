@@ -71,11 +71,11 @@ def without_code(model: Model) -> Model:
 
 
 def evened(model: Model) -> Model:
-    """The same model with its code and its blend shapes scaled so that no input of the layers that read them is small
-    beside the others (Xiao et al. 2023): for runtimes that quantise all inputs of a layer alike."""
+    """The same model with its code and its blend shapes scaled by `evening`: for runtimes that quantise all inputs of a
+    layer alike."""
     network = model.network
     largest = np.abs(ordinary_weights(model)).max(axis=0)
-    of_shapes = _evening(largest, network.shapes)
+    of_shapes = evening(largest, network.shapes)
     *decoder, last = network.decoder
     wide, mix, read = len(network.decoder[0].kernel), network.mix, network.read
     if mix is not None:
@@ -90,7 +90,7 @@ def evened(model: Model) -> Model:
             scale[-len(read.bias) :] = beside
     else:
         limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
-        scale = _evening(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
+        scale = evening(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
         read = read._replace(kernel=read.kernel * scale[:, None])
         network = network._replace(code=network.code._replace(kernel=network.code.kernel * scale[:, None]))
     *hidden, final = network.hidden
@@ -106,8 +106,9 @@ def evened(model: Model) -> Model:
     return dataclasses.replace(model, network=network)
 
 
-def _evening(limits: Array, kernel: Array) -> np.ndarray:
-    """What inputs [n] are to be divided by, that reach to `limits`, and the rows of their kernel [n, m] multiplied."""
+def evening(limits: Array, kernel: Array) -> np.ndarray:
+    """What inputs [n] are to be divided by, that reach to `limits`, and the rows of their kernel [n, m] multiplied, so
+    that of the two neither is small beside the others (Xiao et al. 2023): eight bits are shared by all of a row."""
     weights = np.abs(np.asarray(kernel)).max(axis=1)
     return np.sqrt(np.maximum(limits, 1e-6) / np.maximum(weights, 1e-6)).astype(np.float32)
 

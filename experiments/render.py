@@ -7,8 +7,8 @@
 
 Psi on the body as a film (.webp, .mp4); for a viewer or an animation program with both as meshes (.glb, .usdc, .usda,
 or .obj, of which each frame is a file of its own) or the garment's vertices alone (.pc2, .mdd, with an .obj of the mesh
-to put them on). .png
-compares skinning, Phi, Psi and the reference solver on a clip that `experiments.evaluate` has measured.
+to put them on). .png compares skinning, Phi, Psi and the reference solver on a clip that `experiments.evaluate` has
+measured.
 """
 
 import argparse

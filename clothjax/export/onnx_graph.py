@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from clothjax.folding import evening
 from clothjax.inference import Layer
 from clothjax.types import Array
 
@@ -80,13 +81,11 @@ class Graph:
         return self("Add", self("Add", self.product(held, kernel), self.product(left, kernel)), layer.bias)
 
     def even(self, x: str, limits: Array, layer: Layer) -> str:
-        """`layer` of inputs within +-`limits`, both scaled so that no input is small beside the others (Xiao et al.
-        2023): eight bits, where they are used, are shared by all of a row."""
-        kernel = np.asarray(layer.kernel)
+        """`layer` of inputs within +-`limits`, both scaled by `folding.evening` where matrices have eight bits."""
         if not self.int8:
             return self.layer(x, layer)
-        scale = np.sqrt(np.maximum(limits, 1e-6) / np.maximum(np.abs(kernel).max(axis=1), 1e-6)).astype(np.float32)
-        return self.layer(self("Mul", x, 1.0 / scale), Layer(kernel * scale[:, None], layer.bias))
+        scale = evening(limits, layer.kernel)
+        return self.layer(self("Mul", x, 1.0 / scale), Layer(np.asarray(layer.kernel) * scale[:, None], layer.bias))
 
     def all(self, flags: str, axis: int) -> str:
         """Whether all of bools hold along an axis, which is kept."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from clothjax.export.performance import Performance
+from clothjax.export.performance import Part, Performance
 
 
 def to_pc2(path: str | Path, performance: Performance) -> None:
@@ -37,7 +37,7 @@ def _rest(path: Path, performance: Performance) -> None:
     _mesh(path.with_name(f"{path.stem}_mesh.obj"), performance, 0, performance.parts[-1:])
 
 
-def _mesh(path: Path, performance: Performance, frame: int, parts) -> None:
+def _mesh(path: Path, performance: Performance, frame: int, parts: tuple[Part, ...]) -> None:
     root = np.asarray(performance.root)[frame]
     meshes = {part.name: trimesh.Trimesh(part.vertices[frame] + root, part.faces, process=False) for part in parts}
     path.write_text(trimesh.exchange.obj.export_obj(trimesh.Scene(meshes), include_normals=False, header=""))

@@ -178,10 +178,6 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
         }
         | ({"c": worst["C: folded"]} if library else {}),
         "offscreen_ratio": us["jax: off screen"] / us["jax: folded"],
-        "skips": {
-            name: {run: us[f"{run}: {name}"] / us[f"{run}: folded"] for run in ("jax", "C") if f"{run}: {name}" in us}
-            for name in ("off screen", "half of the vertices")
-        },
         "level_of_detail_ratio": us["jax: folded"] / us["jax: on 4 000 vertices"],
         "shipped_us_all": us,
     }
