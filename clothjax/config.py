@@ -268,6 +268,23 @@ class TuningConfig(Stage1Config):
 
 
 @dataclass(frozen=True)
+class PeerConfig:
+    """A network of a peer in the place of Phi and Psi (`clothjax/peers.py`), trained with the settings of stage 1.
+    Gradients pass through its memory over a whole rollout."""
+
+    network: Literal["", "ncs", "snug", "direct"] = ""
+    """NCS, SNUG's recurrent network, or Psi itself trained directly on the physics: the thesis's ablation, with the
+    sizes of `model` and `stage2`."""
+    width: int = 512
+    """Of the layers of NCS (512 as published) and of each of SNUG's four units (256)."""
+    blendshapes: int = 512
+    """Of NCS."""
+
+    def __post_init__(self):
+        _require(self.width > 0 and self.blendshapes > 0, "peer: sizes must be > 0")
+
+
+@dataclass(frozen=True)
 class RefinementConfig:
     """Training of Psi on what the physics says it should have predicted in its own closed loops
     (`clothjax/refinement.py`). Bodies and materials are those of stage 1."""
@@ -366,6 +383,13 @@ class Config:
     stage2: Stage2Config = field(default_factory=Stage2Config)
     tuning: TuningConfig = field(default_factory=TuningConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    peer: PeerConfig = field(default_factory=PeerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     directory: str = ""
     """Where the run is kept; empty: runs/<name of the config file>."""
+
+    def __post_init__(self):
+        _require(
+            not self.peer.network or self.stage1.start_timestep == 0,
+            "a peer's network does not know the time step: set stage1.start_timestep to 0",
+        )

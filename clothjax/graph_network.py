@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 import jraph
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
 from clothjax.config import Stack
 from clothjax.types import Array, EdgeSet
 
 Params = dict
+ARRIVED = "arrived"  # messages summed at their receivers, which the backward pass keeps
 CHUNK = 1024  # rows of an MLP at a time, where a CPU recomputes it: its layers then stay in the cache
 
 
@@ -172,7 +174,9 @@ def process(
             return _block(p, *carry, rows, among, slots, active, tail), None
 
         if remat:
-            block = jax.checkpoint(block, prevent_cse=False)
+            block = jax.checkpoint(
+                block, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(ARRIVED)
+            )
         carry = (nodes, body, {name: edges[name] for name in stack.edges}, {k: x[rows] for k, x in pairs.items()})
         (nodes, body, updated, near), _ = jax.lax.scan(block, carry, stacked)
         edges = edges | updated
@@ -212,7 +216,7 @@ def _block(params, nodes, body, edges, pairs, rows, graph, slots, active, tail):
         new_pairs["to_body"] = pairs["to_body"] + back
         at_body = jraph.segment_sum(back, slots, len(body))
         new_body = body + _node_update(params["node"], body, slice(None), at_body, tail)
-    everything = jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1)
+    everything = checkpoint_name(jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1), ARRIVED)
     return nodes + _node_update(params["node"], nodes, rows, everything, tail), new_body, new_edges, new_pairs
 
 

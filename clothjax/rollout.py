@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from clothjax import character as characters
 from clothjax import clips as motion
-from clothjax import compact_latent, contact, losses
+from clothjax import compact_latent, contact, garment_model, latent_predictor, losses, peers
 from clothjax.character import Character, Window
 from clothjax.clips import Clips
 from clothjax.config import Config
@@ -32,16 +33,26 @@ Animator = Callable[
 ]
 """From a state, three poses, the character's three frames, a time step and its potential: the next positions [V, 3] m,
 their code [L], and what was seen."""
+MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
+"""An animator of `params` and `statistics`."""
 
 
-def start(character: Character, window: Window, latent_size: int) -> ClothState:
+def memory_size(scene: Scene, config: Config) -> int:
+    """Numbers L that an animator carries from frame to frame: the code, or a peer's memory."""
+    if config.peer.network:
+        return peers.memory_size(config)
+    left, channels = compact_latent.latent_size(scene, config.model)
+    return left * channels
+
+
+def start(character: Character, window: Window, memory_size: int) -> ClothState:
     """A garment as skinned at the current frame, moving with the body."""
     now = characters.skinned(character, window.current)
     return ClothState(
         position=now,
         velocity=now - characters.skinned(character, window.previous),
         acceleration=jnp.zeros_like(now),
-        latent=jnp.zeros(latent_size, now.dtype),
+        latent=jnp.zeros(memory_size, now.dtype),
     )
 
 
@@ -86,6 +97,25 @@ def phi(model: dict, scene: Scene, character: Character, config: Config) -> Anim
         )  # fmt: skip
 
     return animate
+
+
+def peer(kept: np.ndarray) -> MakeAnimator:
+    """The network of a peer, of `params`, as what moves a character's garment: on the joints `kept`."""
+
+    def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
+        constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
+        free = jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
+
+        def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, _potential: Callable):
+            displaced, memory = peers.displacement(
+                model["params"], state.latent, poses, character.joints, constants, scene.body.parents, kept, config
+            )
+            moved = character.template, window.following.garment
+            return garment_model.vertices(displaced * free[:, None], *moved), memory, None
+
+        return animate
+
+    return make
 
 
 def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
@@ -135,7 +165,7 @@ def follow(state: ClothState, advance: Array) -> ClothState:
 
 def settle(animate: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
     """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
-    state = start(character, characters.window(scene, character, poses), _latent_size(scene, config))
+    state = start(character, characters.window(scene, character, poses), memory_size(scene, config))
     if config.stage1.start_timestep == 0:
         return state
     resting = state._replace(velocity=jnp.zeros_like(state.velocity))
@@ -158,13 +188,17 @@ def training_rollout(
     """Mean loss over `frames` frames from a state, with the last state, mean energies in J, and all features.
 
     A `fresh` state takes the quasi-static step first: the body stands, the step is long, and what it started with as
-    velocity is given back after it. Gradients reach back over `config.stage1.gradient_frames` frames.
+    velocity is given back after it. Gradients reach back over `config.stage1.gradient_frames` frames; those of
+    a peer's memory over all.
     """
 
     def body(carry, index):
         state, frame, fresh = carry
         cut = index % config.stage1.gradient_frames == 0
+        through = state.latent
         state = jax.tree.map(lambda x: jnp.where(cut, jax.lax.stop_gradient(x), x), state)
+        if config.peer.network:
+            state = state._replace(latent=through)
         poses = motion.poses(clips, frame)
         still = motion.standing(poses)
         chosen = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), still, poses)
@@ -188,8 +222,8 @@ def training_rollout(
     return jnp.mean(loss), (jax.lax.stop_gradient(state), terms, jax.lax.stop_gradient(seen))
 
 
-def play(model: dict, scene: Scene, character: Character, poses: Pose, config: Config):
-    """Phi in closed loop over a motion.
+def play(model: dict, scene: Scene, character: Character, poses: Pose, config: Config, animator: MakeAnimator = phi):
+    """Phi, or another animator, in closed loop over a motion.
 
     Args:
         model: `params` and `statistics`.
@@ -199,7 +233,7 @@ def play(model: dict, scene: Scene, character: Character, poses: Pose, config: C
         (new [T, V, 3] m relative to each window's current root, states before each step [T], latents [T, L]).
     """
     first = jax.tree.map(lambda x: x[0], poses)
-    animate = phi(model, scene, character, config)
+    animate = animator(model, scene, character, config)
     state = settle(animate, scene, character, first, config)
 
     def body(state, poses):
@@ -207,8 +241,3 @@ def play(model: dict, scene: Scene, character: Character, poses: Pose, config: C
         return follow(taken, poses.translation[2]), (new, state, taken.latent)
 
     return jax.lax.scan(body, state, poses)[1]
-
-
-def _latent_size(scene: Scene, config: Config) -> int:
-    left, channels = compact_latent.latent_size(scene, config.model)
-    return left * channels

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 
-from clothjax import blendshapes, compact_latent, devices, fit, garment_model, rollout
+from clothjax import blendshapes, compact_latent, devices, fit, garment_model, latent_predictor, peers, rollout
 from clothjax import character as characters
 from clothjax import clips as motion
 from clothjax import features as feature
@@ -20,11 +21,9 @@ from clothjax.experiment import material as configured_material
 from clothjax.features import Features
 from clothjax.fit import Weights
 from clothjax.losses import TimeStep
-from clothjax.rollout import Animator
+from clothjax.rollout import MakeAnimator
 from clothjax.scene import Scene
 from clothjax.types import Array, ClothState, Material
-
-MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
 
 
 class Simulation(NamedTuple):
@@ -112,8 +111,7 @@ def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
     frame = motion.draw(clips, jax.random.uniform(keys[2]))
     character = wearer(scene, betas, material, config)
     window = characters.window(scene, character, motion.poses(clips, frame))
-    left, channels = compact_latent.latent_size(scene, config.model)
-    cloth = rollout.start(character, window, left * channels)
+    cloth = rollout.start(character, window, rollout.memory_size(scene, config))
     return Simulation(cloth, betas, material, frame, jnp.asarray(config.stage1.start_timestep > 0))
 
 
@@ -129,6 +127,20 @@ def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None
         params["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(params["garment"])
     statistics = compact_latent.init_statistics(example)
     return starting(params, statistics, key, pool_key, scene, clips, config)
+
+
+def init_peer(scene: Scene, clips: Clips, kept: np.ndarray, shapes: Array, config: Config) -> TrainingState:
+    """The state before the first step of a peer's network, on the joints `kept`.
+
+    Args:
+        shapes: [K, V, 3] m, blend shapes for Psi without stage 1 to start from.
+    """
+    clips = jax.tree.map(jnp.asarray, clips)
+    key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
+    betas = jnp.zeros(scene.body.shapedirs.shape[-1])
+    constants = latent_predictor.constant_inputs(betas, configured_material(config), config.material)
+    params = jax.jit(lambda k: peers.init(k, len(kept), len(constants), shapes, config))(model_key)
+    return starting(params, {}, key, pool_key, scene, clips, config)
 
 
 def starting(

@@ -13,7 +13,8 @@ import yaml
 from clothjax import checkpoint, configuration, storage
 from clothjax.config import Config
 from clothjax.features import Statistics
-from clothjax.latent_predictor import Normalizers, Scale
+from clothjax.latent_predictor import Normalizers, Scale, identity
+from clothjax.types import Material
 
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG = "model.npz", "config.yaml"
@@ -39,7 +40,8 @@ def folder(name: str) -> Path:
 
 
 def phi(run: str | Path) -> tuple[Config, dict]:
-    """The configuration and Phi's `params` and `statistics`, of a run or a packed model.
+    """The configuration and the `params` and `statistics` of Phi, or of a peer's network in its place, of a run or a
+    packed model.
 
     Raises:
         ValueError: if there is no readable one.
@@ -48,15 +50,16 @@ def phi(run: str | Path) -> tuple[Config, dict]:
         config, parts = _unpack(Path(run))
         params, statistics = parts["phi"], parts["statistics"]
     else:
-        parts, _ = checkpoint.read(Path(run) / "stage1" / "checkpoints", "average", "statistics")
         config = _config(Path(run))
-        params, statistics = parts["average"], parts["statistics"]
+        wanted = ("average",) if config.peer.network else ("average", "statistics")
+        parts, _ = checkpoint.read(Path(run) / "stage1" / "checkpoints", *wanted)
+        params, statistics = parts["average"], parts.get("statistics", {})
     return config, {"params": params, "statistics": {name: Statistics(**each) for name, each in statistics.items()}}
 
 
 def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
     """The configuration, the decoder with its blend shapes, the predictor (after all that trained it) and its
-    normalizers, of a run or a packed model.
+    normalizers, of a run or a packed model. Of Psi without stage 1, the normalizers change nothing.
 
     Raises:
         ValueError: if there is no readable one.
@@ -64,6 +67,19 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
     if packed(run):
         config, parts = _unpack(Path(run))
         garment, predictor = parts["phi"]["garment"], parts["predictor"]
+    elif (config := _config(Path(run))).peer.network:
+        if config.peer.network != "direct":
+            raise ValueError(f"{run}: is of {config.peer.network}, which has no latent predictor to use")
+        network = phi(run)[1]["params"]
+        rows = len(network["predictor"]["dense_0"]["kernel"])
+        betas = storage.load_body(config.body).shapedirs.shape[-1]
+        poses = rows - config.model.latent - betas - (len(Material._fields) if config.material.sample else 0)
+        return (
+            config,
+            network["garment"],
+            network["predictor"],
+            Normalizers(identity(config.model.latent), identity(poses)),
+        )
     else:
         directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
         parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")

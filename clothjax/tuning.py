@@ -13,9 +13,8 @@ from clothjax.clips import Clips
 from clothjax.config import Config, Ramp, Stage1Config
 from clothjax.latent_predictor import Normalizers
 from clothjax.losses import TimeStep
-from clothjax.rollout import Animator
+from clothjax.rollout import Animator, MakeAnimator
 from clothjax.scene import Scene
-from clothjax.stage1 import MakeAnimator
 from clothjax.types import Array, ClothState, Pose
 
 

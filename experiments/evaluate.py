@@ -4,7 +4,8 @@
     python -m experiments.evaluate runs/quickstart --motion walk_3 dance.motion.h5 --json report.json
     python -m experiments.evaluate --pretrained all --json report.json
 
-Three stages are measured: `lbs` (plain skinning), `phi` (stage 1) and `psi` (stage 2). No state is borrowed from the
+Three stages are measured: `lbs` (plain skinning), `phi` (stage 1) and `psi` (stage 2); of a run of a peer's network
+`lbs` and that, by its name. No state is borrowed from the
 solver: every number is about the stage's own trajectory, with the configured material and the betas of
 `evaluation.betas_seed`. Averages are over frames; medians and maxima stand beside them.
 
@@ -39,6 +40,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -47,7 +49,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax import character as characters
-from clothjax import clips, experiment, inference, metrics, rollout, simulation, storage, trained
+from clothjax import clips, experiment, inference, latent_predictor, metrics, rollout, simulation, storage, trained
 from clothjax.character import Character
 from clothjax.config import EvaluationConfig
 from clothjax.experiment import Experiment
@@ -55,7 +57,6 @@ from clothjax.types import Motion, Pose
 from experiments.session import fail_clearly, progress, setup
 from experiments.train import load_phi
 
-STAGES = ("lbs", "phi", "psi")
 WEARERS_FRAMES, WEARERS_GAPS = 90, 4  # of the closed loop of each wearer, and where the solver is asked
 SETTLING = 5  # frames left out of averages over time: Psi starts from a garment as skinned
 
@@ -93,8 +94,9 @@ def pretrained(folders: dict[str, Path], motions: list[str] | None = None) -> di
             there = [motion for motion in wanted if storage.asset(motion).is_file()]
             print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
         reports[name] = evaluate(folder, there)
+    stages = next(iter(reports.values()))["evaluation"]
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
-    return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in STAGES}} | flat
+    return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in stages}} | flat
 
 
 def kept(run: Path) -> Path:
@@ -108,18 +110,18 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     Args:
         settings: default: those that the run was trained with.
     """
-    whole, phi = load_phi(run, settings)
+    whole, model = load_phi(run, settings)
     kept(run).mkdir(parents=True, exist_ok=True)
     config = whole.config
     betas = experiment.betas(config)
-    psi = inference.load(run, betas=betas)
+    stages = _stages(whole, model, run)
     character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(
         jnp.asarray(betas), experiment.material(config)
     )
     names = list(motions or config.evaluation.motions)
     if not names:
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motion")
-    play = jax.jit(lambda m, c, p: rollout.play(m, whole.scene, c, p, config)[1].position)
+    garment = None if config.peer.network else model["params"]["garment"]
     each, wearers = {}, {}
     with progress("evaluating", 4 * len(names) + 1) as report:
         for index, name in enumerate(names):
@@ -129,17 +131,14 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
             )
             done = partial(lambda base, n: report(base + n), 4 * index)
             path = kept(run) / f"trajectories_{Path(name).stem}.npz"
-            each[Path(name).stem] = _motion(whole, play, phi, psi, character, betas, clip, done, path)
+            each[Path(name).stem] = _motion(whole, stages, garment, character, betas, clip, done, path)
         first = experiment.motion(whole, names[0])
-        long_phi, long_psi = _long(play, whole, phi, psi, character, first)
+        long = _long(whole, stages, character, first)
         if config.evaluation.wearers:
-            wearers = _wearers(whole, play, phi, run, first)
+            wearers = _wearers(whole, stages, first)
         report(4 * len(names) + 1)
-    summary = {stage: _mean([one[stage] for one in each.values()]) for stage in STAGES}
-    summary["phi"] |= long_phi
-    summary["psi"] |= long_psi
     return {
-        "evaluation": summary,
+        "evaluation": {stage: _mean([one[stage] for one in each.values()]) | long.get(stage, {}) for stage in stages},
         "motions": each,
         "wearers": wearers,
         "betas": betas.tolist(),
@@ -148,14 +147,56 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     }
 
 
-def _motion(whole: Experiment, play, phi, psi, character: Character, betas, clip: Motion, done, path: Path) -> dict:
-    """Measures of the three stages on one clip; keeps its trajectories for pictures."""
+# a garment's trajectory [T - 2, V, 3] m, relative to the root, by what moves it: compiled for a character and a clip
+Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
+
+
+def _stages(whole: Experiment, model: dict, run: Path) -> dict[str, Stage]:
+    """What is measured, by name.
+
+    Args:
+        model: of `load_phi`.
+    """
+    config = whole.config
+    peer = config.peer.network
+    animator = rollout.peer(latent_predictor.kept_joints(whole.names, config.stage2)) if peer else rollout.phi
+    play = jax.jit(lambda m, c, p: rollout.play(m, whole.scene, c, p, config, animator)[1].position)
+
+    def skinned(character: Character, clip: Motion):
+        return lambda: skinned_trajectory(whole, character, windows(clip))
+
+    def network(character: Character, clip: Motion):
+        poses = windows(clip)
+        compiled = play.lower(model, character, poses).compile()
+        return lambda: np.asarray(compiled(model, character, poses))
+
+    def psi(character: Character, clip: Motion):
+        loaded = inference.load(run, betas=np.asarray(character.betas), material=character.material)
+        psi_trajectory(loaded, clip)  # compiles
+        return lambda: psi_trajectory(loaded, clip)
+
+    return {"lbs": skinned} | ({peer: network} if peer else {"phi": network, "psi": psi})
+
+
+def _motion(
+    whole: Experiment,
+    stages: dict[str, Stage],
+    garment: dict | None,
+    character: Character,
+    betas: np.ndarray,
+    clip: Motion,
+    done: Callable[[int], None],
+    path: Path,
+) -> dict:
+    """Measures of the stages on one clip; keeps its trajectories for pictures.
+
+    Args:
+        garment: Phi's decoder and blend shapes.
+    """
     config = whole.config
     poses = windows(clip)
     frames = poses.translation.shape[0]
-    tracks = {"lbs": skinned_trajectory(whole, character, poses)}
-    tracks["phi"] = np.asarray(play(phi, character, poses))
-    tracks["psi"] = psi_trajectory(psi, clip)
+    tracks = {name: stage(character, clip)() for name, stage in stages.items()}
     done(1)
     solved, infos = simulation.simulate(
         whole.scene,
@@ -180,7 +221,7 @@ def _motion(whole: Experiment, play, phi, psi, character: Character, betas, clip
                 poses,
                 sampled,
                 config,
-                phi["params"]["garment"]["blendshapes"] if stage == "phi" else None,
+                garment["blendshapes"] if stage == "phi" else None,
             )
         )
         if whole.scene.touchable:
@@ -201,8 +242,8 @@ def _motion(whole: Experiment, play, phi, psi, character: Character, betas, clip
     return result
 
 
-def _wearers(whole: Experiment, play, phi, run: Path, clip: Motion) -> dict[str, dict]:
-    """Gaps of Phi and Psi on nine wearers, over the start of a clip."""
+def _wearers(whole: Experiment, stages: dict[str, Stage], clip: Motion) -> dict[str, dict]:
+    """Gaps of all stages but skinning on nine wearers, over the start of a clip."""
     config = whole.config
     clip = Motion(clip.rotations[:WEARERS_FRAMES], clip.translation[:WEARERS_FRAMES], clip.fps)
     poses = windows(clip)
@@ -210,36 +251,37 @@ def _wearers(whole: Experiment, play, phi, run: Path, clip: Motion) -> dict[str,
     result = {}
     for name, (betas, material) in experiment.wearers(whole).items():
         character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(betas, material)
-        psi = inference.load(run, betas=betas, material=material)
-        tracks = {"phi": np.asarray(play(phi, character, poses)), "psi": psi_trajectory(psi, clip)}
         result[name] = {
-            stage: metrics.gaps(metrics.step_measures(whole.scene, character, track, poses, sampled, config))
-            for stage, track in tracks.items()
+            stage: metrics.gaps(
+                metrics.step_measures(whole.scene, character, make(character, clip)(), poses, sampled, config)
+            )
+            for stage, make in stages.items()
+            if stage != "lbs"
         }
     return result
 
 
-def _long(play, whole: Experiment, phi, psi, character: Character, clip: Motion) -> tuple[dict, dict]:
-    """Phi, and Psi against Phi, over the long closed loop, with the time of both."""
+def _long(whole: Experiment, stages: dict[str, Stage], character: Character, clip: Motion) -> dict[str, dict]:
+    """All stages but skinning over the long closed loop, with their times, and Psi against Phi."""
     clip = experiment.there_and_back(clip, whole.config.evaluation.long_frames + 2)
-    poses = windows(clip)
-    play = play.lower(phi, character, poses).compile()
-    started = time.perf_counter()
-    one = np.asarray(play(phi, character, poses))
-    phi_seconds = time.perf_counter() - started
-    other = psi_trajectory(psi, clip)  # compiles
-    started = time.perf_counter()
-    psi_trajectory(psi, clip)
-    seconds = time.perf_counter() - started
-    apart = metrics.distance_mm(one, other)
-    return {"finite": bool(np.isfinite(one).all()), "ms_per_frame": 1e3 * phi_seconds / len(one)}, {
-        "psi_phi_mm": float(apart[SETTLING:].mean()),
-        "psi_phi_mm_max": float(apart[SETTLING:].max()),
-        "psi_phi_mm_last100": float(apart[-100:].mean()),
-        "psi_phi_mm_slope": 1e3 * float(np.polyfit(np.arange(len(apart) - SETTLING), apart[SETTLING:], 1)[0]),
-        "finite": bool(np.isfinite(other).all()),
-        "ms_per_frame": 1e3 * seconds / len(other),
-    }
+    tracks, found = {}, {}
+    for name in stages:
+        if name == "lbs":
+            continue
+        run = stages[name](character, clip)
+        started = time.perf_counter()
+        track = tracks[name] = run()
+        seconds = time.perf_counter() - started
+        found[name] = {"finite": bool(np.isfinite(track).all()), "ms_per_frame": 1e3 * seconds / len(track)}
+    if "psi" in tracks:
+        apart = metrics.distance_mm(tracks["phi"], tracks["psi"])
+        found["psi"] |= {
+            "psi_phi_mm": float(apart[SETTLING:].mean()),
+            "psi_phi_mm_max": float(apart[SETTLING:].max()),
+            "psi_phi_mm_last100": float(apart[-100:].mean()),
+            "psi_phi_mm_slope": 1e3 * float(np.polyfit(np.arange(len(apart) - SETTLING), apart[SETTLING:], 1)[0]),
+        }
+    return found
 
 
 def windows(clip: Motion) -> Pose:
@@ -274,10 +316,10 @@ def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
 
 
 def table(stages: dict) -> str:
-    """The measures of the three stages for a reader, as Markdown."""
-    rows = ["| | lbs | phi | psi |", "|---|---|---|---|"]
-    for name in dict.fromkeys(key for stage in STAGES for key in stages[stage]):
-        cells = (_cell(stages[stage].get(name)) for stage in STAGES)
+    """The measures of the stages for a reader, as Markdown."""
+    rows = [f"| | {' | '.join(stages)} |", "|---" * (len(stages) + 1) + "|"]
+    for name in dict.fromkeys(key for measured in stages.values() for key in measured):
+        cells = (_cell(measured.get(name)) for measured in stages.values())
         rows.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(rows)
 

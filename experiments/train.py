@@ -20,9 +20,11 @@ import time
 from pathlib import Path
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from clothjax import (
+    blendshapes,
     checkpoint,
     configuration,
     devices,
@@ -32,6 +34,7 @@ from clothjax import (
     preconditioner,
     principal_shapes,
     refinement,
+    rollout,
     run_folder,
     stage1,
     stage2,
@@ -80,12 +83,12 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
             devices.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
     kept = configuration.to_dict(config)
 
-    began, shapes = time.monotonic(), None
+    if config.peer.network:
+        return _train_peer(whole, reel, directory, device_mesh)
+
+    began = time.monotonic()
     new = not checkpoint.steps(directory / "stage1" / "checkpoints")
-    if new and config.shapes.sequences > 0:
-        devices.say(f"blend shapes: from {config.shapes.sequences} closed loops of cloth that the physics moves")
-        with progress("simulating", config.shapes.sequences) as report:
-            shapes = principal_shapes.principal(whole.scene, reel, config, report, device_mesh)
+    shapes = _principal_shapes(whole, reel, device_mesh) if new and config.shapes.sequences > 0 else None
     state = stage1.init(whole.scene, reel, config, shapes)
     if new and config.model.latent_update == "descent" and config.model.descent_samples > 0:
         model = {"params": state.params, "statistics": state.statistics}
@@ -151,6 +154,39 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         clock["compile_seconds"] += fourth.compile_seconds
         clock["refinement_seconds"] = fourth.seconds
     return clock
+
+
+def _principal_shapes(whole: experiment.Experiment, reel: Clips, device_mesh: Mesh | None) -> np.ndarray:
+    sequences = whole.config.shapes.sequences
+    devices.say(f"blend shapes: from {sequences} closed loops of cloth that the physics moves")
+    with progress("simulating", sequences) as report:
+        return principal_shapes.principal(whole.scene, reel, whole.config, report, device_mesh)
+
+
+def _train_peer(
+    whole: experiment.Experiment, reel: Clips, directory: Path, device_mesh: Mesh | None
+) -> dict[str, float]:
+    """A peer's network, on the physics from its first step; where Phi would be, in `stage1/`."""
+    config, began = whole.config, time.monotonic()
+    new = not checkpoint.steps(directory / "stage1" / "checkpoints")
+    shapes = blendshapes.laplacian(whole.scene, config)
+    if new and config.peer.network == "direct" and config.shapes.sequences > 0:
+        shapes = _principal_shapes(whole, reel, device_mesh)
+    if new:
+        _spent(directory, start_seconds=time.monotonic() - began)
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    devices.say(f"{config.peer.network} on the physics, {config.stage1.steps} steps")
+    fitted = fit.fit(
+        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, device_mesh, rollout.peer(kept)),
+        devices.replicate(stage1.init_peer(whole.scene, reel, kept, shapes, config), device_mesh),
+        steps=config.stage1.steps,
+        steps_per_call=STEPS_PER_CALL,
+        directory=directory / "stage1",
+        config=configuration.to_dict(config),
+        description=f"{config.peer.network}, {config.garment}",
+        may_differ=("directory", "evaluation"),
+    )
+    return {"stage1_seconds": fitted.seconds, "compile_seconds": fitted.compile_seconds}
 
 
 def _refuse_later(directory: Path, stage: str, *later: str) -> None:

@@ -19,7 +19,7 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.inference import Model
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import Motion, Pose
-from experiments.benchmarks import ncs
+from experiments.benchmarks import peers
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -89,10 +89,11 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
             calls[f"psi: {kind}"], size[f"psi: {kind}"] = onnx_call(path, model), path.stat().st_size
             path = _network(model, folder / "network.onnx", int8)
             calls[f"psi network: {kind}"], size[f"psi network: {kind}"] = session_call(path), path.stat().st_size
+    peer = peers.published(vertices)
     for int8 in (False, True):
         for whole in (True, False):
             name = f"ncs{'' if whole else ' network'}{': int8' if int8 else ''}"
-            path = ncs.write(folder / "ncs.onnx", vertices, int8=int8, whole=whole)
+            path = peers.write(folder / "ncs.onnx", peer, int8=int8, whole=whole)
             calls[name], size[name] = session_call(path), path.stat().st_size
     calls |= {f"jax: {name}": jax_call(forms[name]) for name in ("plain", "folded")}
     library = _library(folder)
@@ -241,7 +242,7 @@ def onnx_call(path: Path, model: Model) -> Call:
 
 def session_call(path: Path) -> Call:
     """One call of a graph on random inputs."""
-    return bound(path, ncs.feed(path))
+    return bound(path, peers.feed(path))
 
 
 def bound(path: Path, feed: dict[str, np.ndarray]) -> Call:
