@@ -54,6 +54,7 @@ def simulate(
     config: Config,
     *,
     start: tuple[Array, Array] | None = None,
+    max_iterations: int = 500,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[np.ndarray, list[SolverInfo]]:
     """A motion, solved: the garment [T + 1, V, 3] m relative to the root at every frame, and how each solve ended.
@@ -64,13 +65,16 @@ def simulate(
         poses: windows [T, 3, ...] of `clips.poses`, one a frame.
         start: the garment [V, 3] m at the frame before the first and at the first, each relative to its root. By
             default it starts like Phi: skinned, then one long quasi-static step, whose info comes first.
+        max_iterations: of Newton's method, in a frame.
         progress: called with the number of frames done.
     """
     garment, infos = scene.garment, []
     state = problem(scene, config)
 
     def solve(guess: Array, step: TimeStep) -> np.ndarray:
-        new, info = solver.solve_step(guess, step, scene.mesh, garment.pinned, config.physics)
+        new, info = solver.solve_step(
+            guess, step, scene.mesh, garment.pinned, config.physics, max_iterations=max_iterations
+        )
         infos.append(info)
         return np.asarray(new, np.float32)
 

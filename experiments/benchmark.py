@@ -3,6 +3,7 @@
     python -m experiments.benchmark --part stage1 --json benchmark.json            # the paper's Phi, 4 000 vertices
     python -m experiments.benchmark --part stage1 --quick                          # the embedded 1 000 vertices
     python -m experiments.benchmark --part inference --json inference.json         # Psi on one thread, beside NCS
+    python -m experiments.benchmark tshirt runs/ncs --part pareto --json pareto.json    # error against time
 
 Every time is the median of rounds in which all variants take turns. The processor is measured with and without
 recomputing its blocks in the backward pass (`model.remat`); beside each piece of a training step stand its flops and
@@ -14,6 +15,12 @@ cost against the vertices, or of error against time.
 NCS's network at its published sizes, and a trained garment of the library in its variants (in plain C too where there
 is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over 300 frames of closed
 loop. `floor_us` is how long this machine takes to read as many bytes.
+
+`pareto` gives time and error, on one thread, of every way to move a garment: skinning, Psi and Phi in their variants,
+the solver stopped early, and runs of peers (`configs/ncs.yaml`). It takes folders of runs and names of shipped
+garments, by default all of these. Errors are those of `experiments.evaluate`, in closed loop on motions held out of
+training; `swing_error` is the rms error of the velocity of what skinning does not do, over the solver's. With
+`--compare OLD.json` it says whether two runs put the points in the same order (Kendall's tau).
 """
 
 import argparse
@@ -25,25 +32,39 @@ from pathlib import Path
 
 import jax
 
-from clothjax import configuration
+from clothjax import configuration, trained
 from clothjax.config import Config
-from experiments.benchmarks import inference, scaling, scenes, stage1
+from experiments.benchmarks import inference, pareto, scaling, scenes, stage1
 from experiments.session import fail_clearly, setup
 
 SCENES = ["configs/quickstart.yaml"]
 PAPER = ["configs/paper_tshirt.yaml"]
 ROUNDS = 100  # of inference
 QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
+PARETO = {"rounds": 30, "frames": 60, "gaps": 6}
+QUICK_PARETO = {"rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",)}
 QUICK = ["configs/quickstart.yaml", "--model.body_nodes", "updated"]
 
 
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--part", choices=["stage1", "inference"], default="stage1")
+    parser.add_argument("runs", nargs="*", help="of --part pareto: folders of runs, names of shipped garments")
+    parser.add_argument("--part", choices=["stage1", "inference", "pareto"], default="stage1")
     parser.add_argument("--json", type=Path, default=Path("benchmark.json"))
     parser.add_argument("--quick", action="store_true", help="a small network and few rounds")
+    parser.add_argument("--compare", type=Path, default=None, help="of --part pareto: the JSON of an earlier run")
     arguments = parser.parse_args(argv)
-    if arguments.part == "inference":
+    if arguments.part != "pareto" and (arguments.runs or arguments.compare):
+        raise ValueError("runs and --compare are for --part pareto")
+    if arguments.part == "pareto":
+        inference.one_thread()
+        before = earlier(arguments.compare) if arguments.compare else []
+        names = arguments.runs or trained.shipped()
+        runs = [trained.folder(name) if name in trained.shipped() else Path(name) for name in names]
+        measured = pareto.measure(runs, **(QUICK_PARETO if arguments.quick else PARETO))
+        if before:
+            measured["rank_tau"] = pareto.rank_tau(measured["points"], before)
+    elif arguments.part == "inference":
         inference.one_thread()
         measured = inference.measure(**QUICK_INFERENCE) if arguments.quick else inference.measure(ROUNDS)
     else:
@@ -52,9 +73,23 @@ def main(argv: list[str]) -> None:
     path = arguments.json
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(report, indent=1) + "\n")
-    (inference if arguments.part == "inference" else scaling).plot(measured, path.with_suffix(".png"))
+    {"stage1": scaling, "inference": inference, "pareto": pareto}[arguments.part].plot(
+        measured, path.with_suffix(".png")
+    )
     print(json.dumps(report, indent=1))
     print(f"written to {path} and {path.with_suffix('.png')}")
+
+
+def earlier(path: Path) -> list[dict]:
+    """The points of an earlier report.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    try:
+        return json.loads(path.read_text())["pareto"]["points"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a report of --part pareto ({error!r})") from error
 
 
 def training_step(quick: bool) -> dict:
