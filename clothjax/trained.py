@@ -149,7 +149,8 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
 
 def _config(run: Path) -> Config:
     """The configuration of a run's last stage: those before may have been trained with other settings of later ones."""
-    last = [run / stage / "checkpoints" for stage in STAGES if checkpoint.steps(run / stage / "checkpoints")][-1]
+    first, *later = (run / stage / "checkpoints" for stage in STAGES)
+    last = [first, *(folder for folder in later if checkpoint.steps(folder))][-1]
     return configuration.from_dict(Config, checkpoint.latest(last).config, str(last))
 
 

@@ -19,6 +19,7 @@ from clothjax.storage import UNREADABLE, canonical_rotation, joint_names, load_b
 from clothjax.types import Motion
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
 from data_prep.smpl import BODY
+from experiments.session import fail_clearly
 
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 
@@ -118,4 +119,5 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    with fail_clearly():
+        main(tyro.cli(Arguments))

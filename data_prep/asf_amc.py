@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.plausibility import bad_frames
 from clothjax.storage import joint_names, load_body, save_motion
 from data_prep.retarget import Capture, numbers, read_lines, retarget
+from experiments.session import fail_clearly
 
 CMU_NAMES = {
     "root": "Hips",
@@ -215,4 +216,5 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    with fail_clearly():
+        main(tyro.cli(Arguments))

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.plausibility import bad_frames
 from clothjax.storage import joint_names, load_body, save_motion
 from data_prep.retarget import Capture, cmu_names, numbers, read_lines, retarget
+from experiments.session import fail_clearly
 
 DAZ_NAMES = {"hip": "Hips", "abdomen": "LowerBack", "chest": "Spine1", "neck": "Neck", "head": "Head"}
 for _letter, _side in (("l", "Left"), ("r", "Right")):
@@ -163,4 +164,5 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    with fail_clearly():
+        main(tyro.cli(Arguments))

@@ -1,8 +1,9 @@
-"""Garments built on a body, or taken from a mesh, with the body's skinning and shape diffused onto them.
+"""Garments built on a body, or brought as a mesh, with the body's skinning and shape diffused onto them.
 
     python -m data_prep.garment --template tshirt --vertices 1000 --body body.h5 out.h5
-    python -m data_prep.garment --mesh shirt.obj --body body.h5 out.h5
+    python -m data_prep.garment --mesh shirt.obj --units cm --pin highest --body body.h5 out.h5
 
+A mesh is checked and put right as `data_prep/user_mesh.py` says; what was done is printed, and drawn beside the file.
 A template is an implicit solid around the body that is meshed, cut by planes, remeshed and pushed out of the
 body: an offset of the body's distance field, closed over armpits and crotch, and for what hangs the convex
 hulls of the body's slices.
@@ -25,12 +26,13 @@ from data_prep.diffusion import diffuse
 from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
 from data_prep.remesh import flip, relax, remesh
 from data_prep.retarget import cmu_names
+from data_prep.user_mesh import FOREARM, Answers, Unit, Up, bring, draw
+from experiments.session import fail_clearly
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
 CLEARANCE = 0.004  # m, kept between garment and body
 OFFSET = 0.012  # m, of the solid from the body
 CELL = 0.008  # m, of the distance field's grid
-FOREARM = ("ForeArm", "Hand", "Finger", "Thumb")  # what no template covers
 ARM = ("LeftArm", "RightArm", *FOREARM)
 
 
@@ -292,17 +294,24 @@ def _beyond_plane(point: np.ndarray, normal: np.ndarray, within: float = np.inf)
 
 @dataclass(frozen=True)
 class Arguments:
-    """Makes a garment for a body, from a template or from a mesh that already fits it."""
+    """Makes a garment for a body, from a template or from a mesh that was modelled around it."""
 
     output: tyro.conf.Positional[Path]
     template: Literal["tshirt", "tank", "pants", "skirt", "dress"] = "tshirt"
-    vertices: int = 1000
+    vertices: int | None = None
+    """About so many; default: 1 000 of a template, a mesh as it is."""
     mesh: Path | None = None
-    """A triangle mesh (.obj, .ply, .off, .stl) in metres around the canonical body; instead of a template."""
-    loose: bool = False
-    """For a mesh: diffuse by samples around each vertex, as for skirts."""
-    pin: bool = False
-    """For a mesh: pin its highest opening."""
+    """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose; instead of a template."""
+    units: Unit = "m"
+    """Of the mesh."""
+    up: Up = "y"
+    """The axis of the mesh that points up."""
+    pin: str = "none"
+    """What of the mesh follows the body: none, its `highest` opening, vertices painted `red`, or `object:NAME`."""
+    loose: bool | None = None
+    """Whether the mesh hangs, as skirts do; default: by its distance to the body."""
+    flip: bool = False
+    """The side of the mesh that faces the body is its outside."""
     body: str = "body"
     """File of the body, or the name of the embedded one."""
     licence: str = "CC0-1.0"
@@ -313,15 +322,13 @@ def main(args: Arguments) -> None:
     """Writes the file the arguments ask for."""
     body, names = load_body(args.body), joint_names(args.body)
     if args.mesh is None:
-        garment = build(args.template, args.vertices, body, names, args.seed)
-        source = f"python -m data_prep.garment --template {args.template} --vertices {args.vertices}"
+        count = args.vertices or 1000
+        garment = build(args.template, count, body, names, args.seed)
+        source = f"python -m data_prep.garment --template {args.template} --vertices {count}"
     else:
-        if not args.mesh.is_file():
-            raise ValueError(f"{args.mesh}: no such file")
-        shape, faces = igl.read_triangle_mesh(str(args.mesh))
-        if not len(faces):
-            raise ValueError(f"{args.mesh}: no triangles; export the mesh as triangles")
-        garment = _dress(shape, faces, body, names, (), 500 if args.loose else 0, args.pin, args.seed)
+        answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed)
+        garment, said = bring(args.mesh, body, names, answers)
+        print("\n".join(f"{args.mesh}: {line}" for line in said))
         source = args.mesh.name
     save_garment(
         args.output,
@@ -331,8 +338,11 @@ def main(args: Arguments) -> None:
         source=source,
         licence=args.licence,
     )
+    if args.mesh is not None:
+        draw(args.output.with_suffix(".png"), garment, body)
     print(f"{args.output}: {len(garment.vertices)} vertices, {int(garment.pinned.sum())} pinned")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    with fail_clearly():
+        main(tyro.cli(Arguments))

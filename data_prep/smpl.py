@@ -19,6 +19,7 @@ import tyro
 
 from clothjax.storage import UNREADABLE, save_body
 from clothjax.types import Body
+from experiments.session import fail_clearly
 
 BODY = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
@@ -185,4 +186,5 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    with fail_clearly():
+        main(tyro.cli(Arguments))

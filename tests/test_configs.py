@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from toy import shrink
 
-from clothjax import configuration, experiment, stage1
+from clothjax import blendshapes, configuration, experiment, latent_predictor, rollout, stage1
 from clothjax.config import Config
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
-# like the quickstart, the same program on another mesh; and one that takes a minute and a half
-LONG = ("pants", "skirt", "dress", "protocol", "paper_tshirt")
+# like the quickstart, the same program on another mesh; what tests/test_peers.py has; one of a minute and a half
+LONG = ("pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_tshirt")
 
 
 @pytest.mark.parametrize(
@@ -22,9 +22,15 @@ def test_every_configuration_takes_two_steps(path):
     config = dataclasses.replace(config, motions=("walk_0",))
     whole = experiment.assemble(config)
     reel, _ = experiment.training_clips(whole)
-    state = stage1.init(whole.scene, reel, config)
+    if config.peer.network:
+        kept = latent_predictor.kept_joints(whole.names, config.stage2)
+        state = stage1.init_peer(whole.scene, reel, kept, blendshapes.laplacian(whole.scene, config), config)
+        update = stage1.make_curriculum(whole.scene, reel, config, 2, animator=rollout.peer(kept))
+    else:
+        state = stage1.init(whole.scene, reel, config)
+        update = stage1.make_curriculum(whole.scene, reel, config, 2)
     before = jax.device_get(state.params)
-    state, metrics = stage1.make_curriculum(whole.scene, reel, config, 2)(state)
+    state, metrics = update(state)
     assert int(state.step) == 2
     assert np.isfinite(metrics["loss"]).all() and not metrics["nonfinite"].any()
     assert any((a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params)))

@@ -1,0 +1,327 @@
+"""A garment from a mesh that somebody modelled around a body: checked, welded, put into metres, pushed out of the body.
+
+What can be decided is done and reported; what would be a guess is refused, with the flag that answers it.
+"""
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import igl
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from clothjax import animation
+from clothjax.types import Body, Garment
+from data_prep.diffusion import diffuse
+from data_prep.mesh import boundary_loops, compact, components, edge_table
+from data_prep.remesh import remesh
+from data_prep.retarget import cmu_names
+
+Unit = Literal["m", "cm", "mm", "in", "ft"]
+Up = Literal["y", "z"]
+UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+TURNS = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}  # to +Y up
+WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+WELD = 1e-4  # m, vertices closer than this are one
+CLEARANCE = 0.004  # m, kept between garment and body
+NEAR = 0.25  # m, a garment's mean distance to the body is less ...
+INSIDE = 10  # ... and counts so many times more where it is inside
+LOOSE = 0.03  # m, the median distance from which a garment counts as loose
+DEEP, MANY = 0.03, 0.15  # m inside the body, and the share of vertices so deep that the garment is another body's
+FOREARM = ("ForeArm", "Hand", "Finger", "Thumb")  # what many garments do not cover
+FEWEST, MOST = 100, 20_000  # vertices
+PINNED = (0.85, 0.1, 0.1)
+SAMPLES = 500  # of the diffusion onto loose garments
+
+
+class Answers(NamedTuple):
+    """What only the user knows."""
+
+    units: Unit = "m"
+    up: Up = "y"
+    pin: str = "none"  # none, highest, red, or object:NAME
+    vertices: int | None = None  # wanted; None: the mesh as it is
+    loose: bool | None = None  # None: by its distance to the body
+    flip: bool = False  # the side that faces the body is the outside
+    seed: int = 0
+
+
+class Mesh(NamedTuple):
+    """A mesh as it is in the file."""
+
+    vertices: np.ndarray  # [V, 3] in the file's units
+    faces: np.ndarray  # [F, 3]
+    red: np.ndarray  # [V] bool, painted red
+    objects: dict[str, np.ndarray]  # by name, [V] bool
+
+
+def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers) -> tuple[Garment, list[str]]:
+    """The garment, and lines that say what was done to the mesh; `names` are those of the body's joints.
+
+    Raises:
+        ValueError: naming the file, the place in it, and what to do.
+    """
+    mesh, said = read(path), []
+    surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
+    _check_place(path, mesh.vertices, surface, answers)
+    points = UNITS[answers.units] * mesh.vertices @ TURNS[answers.up].T
+    points, faces, now = _clean(path, points, mesh.faces, said)
+    marked = np.isin(np.arange(len(points)), now[_marked(path, mesh, answers.pin)])
+    faces = _oriented(path, points, faces, surface, answers.flip, said)
+    if answers.vertices:
+        points, faces, marked = _resampled(points, faces, marked, answers.vertices, said)
+    if not FEWEST <= len(points) <= MOST:
+        raise ValueError(
+            f"{path}: {len(points)} vertices; {FEWEST} to {MOST} can be trained: give --vertices for another number"
+        )
+    points = _pushed_out(path, points, surface, said)
+    distance = np.abs(igl.signed_distance(points, *surface, sign_type=WINDING)[0])
+    loose = bool(np.median(distance) > LOOSE) if answers.loose is None else answers.loose
+    said.append(
+        f"{'loose' if loose else 'tight'}: {1e3 * np.median(distance):.0f} mm from the body in the middle, so skin and "
+        f"shape are those of the body {'around' if loose else 'nearest to'} each vertex"
+    )
+    weights, shapedirs = diffuse(
+        points, faces, body, samples=SAMPLES if loose else 0, hidden=_bare(points, body, names), seed=answers.seed
+    )
+    pinned = marked
+    if answers.pin == "highest":
+        loops = boundary_loops(faces)
+        if not loops:
+            raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
+        pinned = np.zeros(len(points), bool)
+        pinned[max(loops, key=lambda loop: points[loop, 1].mean())] = True
+    parts = 1 + int(components(faces, len(points)).max())
+    said.append(
+        f"{len(points)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, {len(boundary_loops(faces))} "
+        f"openings, {int(pinned.sum())} vertices pinned"
+    )
+    return Garment(points.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned), said
+
+
+def read(path: str | Path) -> Mesh:
+    """A mesh file (.obj, .ply, .off, .stl, .glb), all of its objects in one.
+
+    Raises:
+        ValueError: if it is not one, has no triangles, or a vertex that is not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        scene = trimesh.load_scene(path, process=False, split_objects=True, group_material=False, skip_materials=True)
+        parts = []
+        for node in scene.graph.nodes_geometry:
+            place, name = scene.graph[node]
+            if isinstance(scene.geometry[name], trimesh.Trimesh) and len(scene.geometry[name].faces):
+                parts.append((name, scene.geometry[name].copy().apply_transform(place)))
+    except Exception as error:  # whatever a reader of a damaged file of some format raises
+        raise ValueError(f"{path}: not a mesh that can be read ({_brief(error)}); export it as .obj or .glb") from error
+    if not parts:
+        raise ValueError(f"{path}: no triangles; export the mesh with its faces")
+    starts = np.cumsum([0, *(len(part.vertices) for _, part in parts)])
+    vertices = np.concatenate([np.asarray(part.vertices, np.float64) for _, part in parts])
+    faces = np.concatenate([np.asarray(part.faces, np.int64) + start for (_, part), start in zip(parts, starts)])
+    wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(wrong):
+        raise ValueError(f"{path}: vertex {wrong[0] + 1} of {len(vertices)} is not finite: {vertices[wrong[0]]}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"{path}: a face names vertex {faces.max() + 1} of {len(vertices)}")
+    objects = {
+        name: (start <= np.arange(len(vertices))) & (np.arange(len(vertices)) < end)
+        for (name, _), start, end in zip(parts, starts[:-1], starts[1:])
+    }
+    return Mesh(vertices, faces, np.concatenate([_red(part) for _, part in parts]), objects)
+
+
+def _brief(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+def _red(part: trimesh.Trimesh) -> np.ndarray:
+    if part.visual.kind != "vertex":
+        return np.zeros(len(part.vertices), bool)
+    red, green, blue = np.asarray(part.visual.vertex_colors)[:, :3].astype(int).T
+    return (red > 150) & (green < 100) & (blue < 100)
+
+
+def _check_place(path, vertices: np.ndarray, surface, answers: Answers) -> None:
+    """Refuses a mesh that is not around the body as the user says it is, and says how it would be."""
+
+    def away(units: str, up: str) -> float:
+        """How far from being worn, in m: the mean distance to the body, and more for what is inside; infinite where
+        the mesh is far larger or smaller."""
+        points = UNITS[units] * vertices @ TURNS[up].T
+        height = np.ptp(surface[0][:, 1])
+        if not 0.05 * height < np.ptp(points, axis=0).max() < 1.5 * height:
+            return np.inf
+        few = points[:: max(1, len(points) // 500)]
+        signed = igl.signed_distance(few, *surface, sign_type=WINDING)[0]
+        return float(np.mean(np.abs(signed)) + INSIDE * np.mean(np.maximum(-signed, 0.0)))
+
+    found = {(units, up): away(units, up) for units in UNITS for up in TURNS}
+    (units, up), best = min(found.items(), key=lambda item: item[1])
+    told = found[answers.units, answers.up]
+    if told < NEAR and told < 2 * best + 0.01:
+        return
+    size = np.ptp(vertices, axis=0)
+    shown = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {answers.units}, {answers.up.upper()} up"
+    if best < NEAR:
+        raise ValueError(f"{shown}: that is not around the body. Is it meant to be --units {units} --up {up}?")
+    raise ValueError(
+        f"{shown}: in no unit around the body, which is {np.ptp(surface[0][:, 1]):.2f} m high with its middle at "
+        f"{np.round(0.5 * (surface[0].min(axis=0) + surface[0].max(axis=0)), 2)}: move the mesh onto the body in its "
+        "canonical pose"
+    )
+
+
+def _clean(path, points: np.ndarray, faces: np.ndarray, said: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh without double vertices and faces without area, and for each vertex of the file which one it is now, -1
+    for none."""
+    near = cKDTree(points).query_pairs(WELD, output_type="ndarray")
+    _, first, index = np.unique(components(near, len(points)), return_index=True, return_inverse=True)
+    if len(first) < len(points):
+        said.append(f"welded: {len(points) - len(first)} vertices lay on others")
+    points, faces = points[first], index[faces]
+    corners = points[faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    _, unlike = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    kept = (area > 1e-10) & np.isin(np.arange(len(faces)), unlike)
+    if not kept.all():
+        said.append(f"left out: {int((~kept).sum())} faces without area, or twice there")
+    if not kept.any():
+        raise ValueError(f"{path}: no face has any area")
+    used = np.unique(faces[kept])
+    if len(used) < len(points):
+        said.append(f"left out: {len(points) - len(used)} vertices without a face")
+    points, faces = compact(points, faces[kept])
+    now = np.full(len(first), -1)
+    now[used] = np.arange(len(used))
+    edges, _, sharing = edge_table(faces)
+    crowded = np.flatnonzero(sharing > 2)
+    if len(crowded):
+        middle = np.round(points[edges[crowded[0]]].mean(axis=0), 3)
+        raise ValueError(
+            f"{path}: {len(crowded)} edges have more than two faces, the first at {middle} m: a cloth has two sides; "
+            "separate the layers there, or delete the inner faces"
+        )
+    return points, faces, now[index]
+
+
+def _marked(path, mesh: Mesh, pin: str) -> np.ndarray:
+    """Vertices that the file itself says are pinned."""
+    if pin in ("none", "highest"):
+        return np.zeros(len(mesh.vertices), bool)
+    if pin == "red":
+        if not mesh.red.any():
+            raise ValueError(
+                f"{path}: --pin red, but no vertex is painted red (.ply and .glb keep colours of vertices)"
+            )
+        return mesh.red
+    if pin.startswith("object:"):
+        name = pin.removeprefix("object:")
+        if name not in mesh.objects:
+            raise ValueError(f"{path}: has no object {name!r} to pin; there are: {', '.join(mesh.objects)}")
+        return mesh.objects[name]
+    raise ValueError(f"--pin {pin}: choose none, highest, red or object:NAME")
+
+
+def _oriented(path, points, faces, surface, flip: bool, said: list[str]) -> np.ndarray:
+    """Faces of each part turned one way, with the outside away from the body."""
+    turned, part = igl.bfs_orient(faces)
+    halves = turned[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    if len(np.unique(halves, axis=0)) < len(halves):
+        raise ValueError(f"{path}: has only one side (a Moebius strip): cut it open")
+    foot = igl.signed_distance(points, *surface, sign_type=WINDING)[2]
+    corners = points[turned]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = np.bincount(part, ((points - foot)[turned].mean(axis=1) * normal).sum(axis=1))
+    wrong = (outward < 0) != flip
+    turned = np.where(wrong[part][:, None], turned[:, ::-1], turned)
+    changed = int((_winding(turned) != _winding(faces)).sum())
+    if changed:
+        said.append(f"turned: {changed} of {len(faces)} faces, so that all look away from the body")
+    return turned
+
+
+def _winding(faces: np.ndarray) -> np.ndarray:
+    """Whether each face [F, 3] goes through its vertices in ascending order, but for where it starts."""
+    start = faces.argmin(axis=1)
+    rows = np.arange(len(faces))
+    return faces[rows, (start + 1) % 3] < faces[rows, (start + 2) % 3]
+
+
+def _resampled(points, faces, marked, wanted: int, said: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The surface with about so many vertices, each of them pinned if the nearest before was."""
+    area = igl.doublearea(points, faces).sum()
+    length = np.sqrt(area / wanted / np.sqrt(3))
+    shape, triangles = remesh(points, faces, length, 6)
+    for _ in range(4):
+        if abs(len(shape) / wanted - 1) < 0.03:
+            break
+        length *= np.sqrt(len(shape) / wanted)
+        shape, triangles = remesh(shape, triangles, length, 3)
+    said.append(f"remeshed: {len(points)} vertices to {len(shape)}, edges of {1e3 * length:.0f} mm")
+    nearest = np.linalg.norm(shape[:, None] - points[marked][None], axis=-1).min(axis=1) if marked.any() else np.inf
+    return shape, triangles, np.broadcast_to(nearest < 0.5 * length, len(shape)).copy()
+
+
+def _bare(points: np.ndarray, body: Body, names: tuple[str, ...]) -> np.ndarray:
+    """Whether each vertex of the body [B] is of a forearm or a hand that the garment does not cover: a skirt must not
+    follow the hands beside it."""
+    parts = [any(part in name for part in FOREARM) for name in cmu_names(names)]
+    hidden = np.asarray(body.weights)[:, parts].sum(axis=1) > 0.3
+    distance, nearest = cKDTree(body.vertices).query(points)
+    covered = (hidden[nearest] & (distance < LOOSE)).mean() > 0.01
+    return hidden & ~covered
+
+
+def _pushed_out(path, points: np.ndarray, surface, said: list[str]) -> np.ndarray:
+    """The vertices, none of them in the body or nearer to it than CLEARANCE."""
+    start = points
+    signed = igl.signed_distance(points, *surface, sign_type=WINDING)[0]
+    deep = float((signed < -DEEP).mean())
+    if deep > MANY:
+        raise ValueError(
+            f"{path}: {100 * deep:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, at most "
+            f"{-1e3 * signed.min():.0f}: it was made for another body or another pose; --body names the body"
+        )
+    for _ in range(10):
+        signed, _, foot = igl.signed_distance(points, *surface, sign_type=WINDING)[:3]
+        short = np.flatnonzero(signed < 0.999 * CLEARANCE)
+        if not len(short):
+            break
+        away = (points[short] - foot[short]) * np.sign(signed[short])[:, None]
+        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+        points = points.copy()
+        points[short] = foot[short] + 1.02 * CLEARANCE * away
+    moved = np.linalg.norm(points - start, axis=1)
+    if moved.any():
+        said.append(
+            f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most"
+        )
+    return points
+
+
+def draw(path: str | Path, garment: Garment, body: Body) -> None:
+    """A picture of the garment on the body from four sides, with pinned vertices as red dots; without the extra
+    `render`, none."""
+    surfaces = [
+        animation.Surface(np.asarray(body.vertices), np.asarray(body.faces), animation.SKIN),
+        animation.Surface(garment.vertices, garment.faces),
+    ]
+    dot = trimesh.creation.icosphere(1, 0.006)
+    places = garment.vertices[garment.pinned]
+    if len(places):
+        dots = (places[:, None] + np.asarray(dot.vertices)[None]).reshape(-1, 3)
+        faces = (len(dot.vertices) * np.arange(len(places))[:, None, None] + np.asarray(dot.faces)[None]).reshape(-1, 3)
+        surfaces.append(animation.Surface(dots, faces, PINNED))
+    views = ("front", "three-quarter", "side", "back")
+    try:
+        size = np.ptp(garment.vertices, axis=0)
+        margin = 1.2 * max(1.0, 4 / 3 * size[[0, 2]].max() / size[1])
+        pictures = [animation.render(surfaces, animation.camera_for(garment.vertices, view, margin)) for view in views]
+        animation.comparison(path, {"": pictures}, views)
+    except ImportError as error:
+        print(f"{path}: not drawn ({error})")

@@ -1,0 +1,187 @@
+"""A mesh that somebody brings becomes a garment, or is refused with what to do about it."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from clothjax import storage
+from data_prep import garment as program
+from data_prep import user_mesh
+from data_prep.user_mesh import Answers, bring
+
+
+@pytest.fixture(scope="module")
+def body():
+    return storage.load_body("body")
+
+
+@pytest.fixture(scope="module")
+def names():
+    return storage.joint_names("body")
+
+
+@pytest.fixture(scope="module")
+def skirt(body):
+    """Vertices and faces of the embedded skirt."""
+    made = storage.load_garment("skirt_1000", body)
+    return np.asarray(made.vertices, np.float64), np.asarray(made.faces, np.int64)
+
+
+@pytest.fixture
+def save(tmp_path):
+    """Writes a mesh; returns its path."""
+
+    def write(vertices, faces, name="skirt.obj", colours=None):
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        if colours is not None:
+            mesh.visual.vertex_colors = colours
+        mesh.export(tmp_path / name)
+        return tmp_path / name
+
+    return write
+
+
+def nearest(points, others):
+    return np.linalg.norm(points[:, None] - others[None], axis=-1).min(axis=1)
+
+
+def test_a_mesh_that_fits_is_left_as_it_is(skirt, body, names, save):
+    vertices, _ = skirt
+    made, said = bring(save(*skirt), body, names, Answers(pin="highest"))
+    assert len(made.vertices) == len(vertices) and nearest(made.vertices, vertices).max() < 1e-5
+    assert made.vertices[made.pinned, 1].min() > vertices[:, 1].max() - 0.05 and made.pinned.sum() > 20
+    assert any(line.startswith("loose") for line in said)
+    # the skirt follows the hips and legs, not the hands that hang beside it
+    arms = [i for i, name in enumerate(names) if any(part in name for part in user_mesh.FOREARM)]
+    assert made.weights[:, arms].max() < 0.05
+    np.testing.assert_allclose(made.weights.sum(axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("units, up", [("cm", "y"), ("mm", "z"), ("m", "z"), ("in", "y")])
+def test_units_and_axes_are_asked_for(skirt, body, names, save, units, up):
+    vertices, faces = skirt
+    path = save(vertices @ user_mesh.TURNS[up] / user_mesh.UNITS[units], faces)
+    with pytest.raises(ValueError, match=rf"skirt\.obj.*--units {units} --up {up}\?"):
+        bring(path, body, names, Answers())
+    made, _ = bring(path, body, names, Answers(units, up))
+    assert nearest(made.vertices, vertices).max() < 1e-4
+
+
+def test_what_is_nowhere_near_the_body_is_refused(skirt, body, names, save):
+    vertices, faces = skirt
+    with pytest.raises(ValueError, match="move the mesh onto the body"):
+        bring(save(vertices + [3.0, 0, 0], faces), body, names, Answers())
+
+
+def test_seams_are_welded_and_faces_turned(skirt, body, names, save):
+    vertices, faces = skirt
+    torn = vertices[faces].reshape(-1, 3)  # every face for itself
+    apart = np.arange(len(torn)).reshape(-1, 3)
+    apart[::3] = apart[::3, ::-1]
+    apart = np.concatenate([apart, apart[:2], [[0, 0, 1]]])
+    made, said = bring(save(torn, apart, "torn.stl"), body, names, Answers())
+    assert len(made.vertices) == len(vertices) and len(made.faces) == len(faces)
+    assert any(line.startswith("welded") for line in said) and any(line.startswith("turned") for line in said)
+    corners = made.vertices[made.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normal * (corners.mean(axis=1) - body.joints[0]) * [1, 0, 1]).sum() > 0
+    inward, _ = bring(save(torn, apart, "torn.stl"), body, names, Answers(flip=True))
+    corners = inward.vertices[inward.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normal * (corners.mean(axis=1) - body.joints[0]) * [1, 0, 1]).sum() < 0
+
+
+def test_pins_by_colour_and_by_object(skirt, body, names, save, tmp_path):
+    vertices, faces = skirt
+    top = vertices[:, 1] > vertices[:, 1].max() - 0.03
+    colours = np.where(top[:, None], [200, 10, 10, 255], [180, 180, 180, 255])
+    made, _ = bring(save(vertices, faces, "painted.ply", colours), body, names, Answers(pin="red"))
+    assert nearest(made.vertices[made.pinned], vertices[top]).max() < 1e-5 and made.pinned.sum() == top.sum()
+    band, rest = (np.all(top[faces], axis=1), ~np.all(top[faces], axis=1))
+    scene = trimesh.Scene()
+    for name, part in (("band", band), ("cloth", rest)):
+        scene.add_geometry(trimesh.Trimesh(vertices, faces[part], process=False), geom_name=name)
+    for name in ("parts.obj", "parts.glb"):
+        scene.export(tmp_path / name)
+        made, said = bring(tmp_path / name, body, names, Answers(pin="object:band"))
+        assert len(made.vertices) == len(vertices) and any(line.startswith("welded") for line in said)
+        of_band = np.zeros(len(vertices), bool)
+        of_band[faces[band]] = True
+        assert made.pinned.sum() == of_band.sum()
+    with pytest.raises(ValueError, match=r"no object 'hem'.*band, cloth|no object 'hem'.*cloth, band"):
+        bring(tmp_path / "parts.glb", body, names, Answers(pin="object:hem"))
+    with pytest.raises(ValueError, match="painted red"):
+        bring(save(*skirt), body, names, Answers(pin="red"))
+
+
+def test_it_is_pushed_out_of_the_body_and_remeshed(skirt, body, names, save):
+    import igl
+
+    vertices, faces = skirt
+    tight = vertices * [0.82, 1, 0.82] + [0, 0, 0.01]
+    made, said = bring(save(tight, faces), body, names, Answers(vertices=600))
+    assert abs(len(made.vertices) / 600 - 1) < 0.1
+    signed = igl.signed_distance(
+        made.vertices.astype(float), np.asarray(body.vertices, float), np.asarray(body.faces, np.int64),
+        sign_type=user_mesh.WINDING,
+    )[0]  # fmt: skip
+    assert signed.min() > 0.9 * user_mesh.CLEARANCE
+    assert any("pushed out" in line for line in said) and any("remeshed" in line for line in said)
+    with pytest.raises(ValueError, match="inside the body"):
+        bring(save(vertices * [0.4, 1, 0.4], faces), body, names, Answers())
+
+
+def test_what_is_no_cloth_is_refused_by_place(skirt, body, names, save, tmp_path):
+    vertices, faces = skirt
+    a, b, _ = faces[0]
+    fin = np.concatenate([vertices, vertices[[a]] + [0, 0, 0.05]])
+    with pytest.raises(ValueError, match="1 edges have more than two faces, the first at"):
+        bring(save(fin, np.concatenate([faces, [[a, b, len(vertices)]]])), body, names, Answers())
+    with pytest.raises(ValueError, match=r"--vertices"):
+        bring(save(*trimesh.remesh.subdivide_loop(vertices, faces, 3)), body, names, Answers())
+    path = save(*skirt)
+    path.write_text(_with_nan(path.read_text()))
+    with pytest.raises(ValueError, match=r"vertex 5 of \d+ is not finite"):
+        bring(path, body, names, Answers())
+    for name, text in {
+        "empty.obj": "",
+        "points.obj": "v 0 0 0\nv 1 0 0\n",
+        "junk.glb": "glTF",
+        "odd.xyz9": "1",
+    }.items():
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match=name):
+            bring(tmp_path / name, body, names, Answers())
+    with pytest.raises(ValueError, match=r"none\.obj: no such file"):
+        bring(tmp_path / "none.obj", body, names, Answers())
+    with pytest.raises(ValueError, match="--pin sideways"):
+        bring(save(*skirt), body, names, Answers(pin="sideways"))
+
+
+def _with_nan(text: str) -> str:
+    lines = text.splitlines()
+    fifth = [i for i, line in enumerate(lines) if line.startswith("v ")][4]
+    lines[fifth] = "v nan 0.1 0.1"
+    return "\n".join(lines)
+
+
+def test_a_moebius_strip_is_refused(body, names, save):
+    around = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    middle = body.joints[0] + 0.3 * np.stack([np.cos(around), 0 * around, np.sin(around)], axis=1)
+    across = np.stack([np.cos(around) * np.cos(around / 2), np.sin(around / 2), np.sin(around) * np.cos(around / 2)], 1)
+    rows = np.stack([middle - 0.05 * across, middle + 0.05 * across], axis=1).reshape(-1, 3)
+    quads = []
+    for i in range(60):
+        a, b, c, d = 2 * i, 2 * i + 1, (2 * i + 2) % 120, (2 * i + 3) % 120
+        if i == 59:
+            c, d = d, c
+        quads += [[a, b, c], [b, d, c]]
+    with pytest.raises(ValueError, match="one side"):
+        bring(save(rows, np.array(quads)), body, names, Answers())
+
+
+def test_the_program_writes_a_garment_and_its_picture(skirt, body, save, tmp_path, capsys):
+    path = save(100 * skirt[0], skirt[1])
+    program.main(program.Arguments(tmp_path / "mine.h5", mesh=path, units="cm", pin="highest"))
+    assert storage.load_garment(tmp_path / "mine.h5", body).pinned.sum() > 20
+    assert (tmp_path / "mine.png").stat().st_size > 1e4 and "openings" in capsys.readouterr().out
