@@ -129,8 +129,8 @@ def read(path: str | Path) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path}: a face names vertex {faces.max() + 1} of {len(vertices)}")
     objects = {
-        name: (start <= np.arange(len(vertices))) & (np.arange(len(vertices)) < end)
-        for (name, _), start, end in zip(parts, starts[:-1], starts[1:])
+        name: np.isin(np.arange(len(vertices)), np.asarray(part.faces) + start)
+        for (name, part), start in zip(parts, starts)
     }
     return Mesh(vertices, faces, np.concatenate([_red(part) for _, part in parts]), objects)
 
@@ -149,25 +149,27 @@ def _red(part: trimesh.Trimesh) -> np.ndarray:
 def _check_place(path, vertices: np.ndarray, surface, answers: Answers) -> None:
     """Refuses a mesh that is not around the body as the user says it is, and says how it would be."""
 
-    def away(units: str, up: str) -> float:
-        """How far from being worn, in m: the mean distance to the body, and more for what is inside; infinite where
-        the mesh is far larger or smaller."""
+    def away(units: str, up: str) -> tuple[float, float]:
+        """Mean distance to the body in m, and the same with more for what is inside; infinite where the mesh is far
+        larger or smaller."""
         points = UNITS[units] * vertices @ TURNS[up].T
         height = np.ptp(surface[0][:, 1])
         if not 0.05 * height < np.ptp(points, axis=0).max() < 1.5 * height:
-            return np.inf
+            return np.inf, np.inf
         few = points[:: max(1, len(points) // 500)]
         signed = igl.signed_distance(few, *surface, sign_type=WINDING)[0]
-        return float(np.mean(np.abs(signed)) + INSIDE * np.mean(np.maximum(-signed, 0.0)))
+        distance = np.mean(np.abs(signed))
+        return float(distance), float(distance + INSIDE * np.mean(np.maximum(-signed, 0.0)))
 
     found = {(units, up): away(units, up) for units in UNITS for up in TURNS}
-    (units, up), best = min(found.items(), key=lambda item: item[1])
-    told = found[answers.units, answers.up]
-    if told < NEAR and told < 2 * best + 0.01:
+    near = {how: worn for how, (distance, worn) in found.items() if distance < NEAR}
+    told = near.get((answers.units, answers.up), np.inf)
+    if told < np.inf and told <= 2 * min(near.values()) + 0.01:
         return
     size = np.ptp(vertices, axis=0)
     shown = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {answers.units}, {answers.up.upper()} up"
-    if best < NEAR:
+    if near:
+        units, up = min(near, key=near.get)
         raise ValueError(f"{shown}: that is not around the body. Is it meant to be --units {units} --up {up}?")
     raise ValueError(
         f"{shown}: in no unit around the body, which is {np.ptp(surface[0][:, 1]):.2f} m high with its middle at "

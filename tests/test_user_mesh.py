@@ -6,7 +6,7 @@ import trimesh
 
 from clothjax import storage
 from data_prep import garment as program
-from data_prep import user_mesh
+from data_prep import mesh, user_mesh
 from data_prep.user_mesh import Answers, bring
 
 
@@ -133,7 +133,8 @@ def test_it_is_pushed_out_of_the_body_and_remeshed(skirt, body, names, save):
 
 def test_what_is_no_cloth_is_refused_by_place(skirt, body, names, save, tmp_path):
     vertices, faces = skirt
-    a, b, _ = faces[0]
+    border = mesh.boundary_mask(faces, len(vertices))
+    a, b, _ = faces[np.flatnonzero(~border[faces].any(axis=1))[0]]
     fin = np.concatenate([vertices, vertices[[a]] + [0, 0, 0.05]])
     with pytest.raises(ValueError, match="1 edges have more than two faces, the first at"):
         bring(save(fin, np.concatenate([faces, [[a, b, len(vertices)]]])), body, names, Answers())
