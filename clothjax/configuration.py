@@ -117,6 +117,8 @@ def _refuse_duplicates(node: yaml.Node | None, path: Path) -> None:
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key, child in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise ValueError(f"{path}, line {key.start_mark.line + 1}: a setting's name must be one word")
             if key.value in seen:
                 raise ValueError(f"{path}, line {key.start_mark.line + 1}: {key.value!r} is set twice")
             seen.add(key.value)

@@ -21,6 +21,8 @@ On reading, any `format` that ends in /body, /garment or /motion will do, and fu
 """
 
 import os
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -36,7 +38,10 @@ from clothjax.types import Body, Garment, Motion
 
 VERSION = 1
 # what readers of files raise where these are damaged or of another kind
-UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (
+    ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, RuntimeError, ArithmeticError, MemoryError,
+    SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 ASSETS = Path(__file__).parent / "assets"
 
 
@@ -248,9 +253,11 @@ def _open(path: str | Path, kind: str) -> Iterator[h5py.File]:
 def _dataset(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int]) -> np.ndarray:
     """A dataset of a shape given by numbers and letters; a letter new to `sizes` takes the size found."""
     if name not in file:
-        raise ValueError(f"{file.filename}: dataset {name!r} is missing; it has {', '.join(sorted(file))}")
+        raise ValueError(f"{file.filename}: dataset {name!r} is missing; it has {', '.join(sorted(map(str, file)))}")
     found = file[name].shape
     wanted = tuple(sizes.get(n, n) for n in shape)
+    if found[:1] == (0,):
+        raise ValueError(f"{file.filename}: dataset {name!r} is empty")
     if len(found) != len(wanted) or any(isinstance(w, int) and w != f for f, w in zip(found, wanted)):
         text = ", ".join(f"{n} = {sizes[n]}" if n in sizes else str(n) for n in shape)
         raise ValueError(f"{file.filename}: dataset {name!r} has shape {found}, expected ({text})")
@@ -351,11 +358,14 @@ def _write(path: str | Path, kind: str, data: dict[str, np.ndarray], **attribute
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with h5py.File(partial, "w") as file:
+        # of this version all that describes the data is checked by sums: libhdf5 can crash where it is damaged
+        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             fixed = {"format": f"clothjax/{kind}", "version": VERSION, "units": "m", "up": "+Y"}
             file.attrs.update({**fixed, **attributes})
             for key, value in data.items():
-                file.create_dataset(key, data=value, compression="gzip", compression_opts=9, shuffle=True)
+                summed = np.asarray(value).dtype.kind in "biuf"
+                options = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": summed}
+                file.create_dataset(key, data=value, **options)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -53,8 +53,8 @@ def phi(run: str | Path) -> tuple[Config, dict]:
         config = _config(Path(run))
         wanted = ("average",) if config.peer.network else ("average", "statistics")
         parts, _ = checkpoint.read(Path(run) / "stage1" / "checkpoints", *wanted)
-        params, statistics = parts["average"], parts.get("statistics", {})
-    return config, {"params": params, "statistics": {name: Statistics(**each) for name, each in statistics.items()}}
+        params, statistics = parts["average"], _statistics(parts.get("statistics", {}))
+    return config, {"params": params, "statistics": statistics}
 
 
 def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
@@ -66,7 +66,7 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
     """
     if packed(run):
         config, parts = _unpack(Path(run))
-        garment, predictor = parts["phi"]["garment"], parts["predictor"]
+        garment, predictor, normalizers = parts["phi"]["garment"], parts["predictor"], parts["normalizers"]
     elif (config := _config(Path(run))).peer.network:
         if config.peer.network != "direct":
             raise ValueError(f"{run}: is of {config.peer.network}, which has no latent predictor to use")
@@ -74,12 +74,8 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
         rows = len(network["predictor"]["dense_0"]["kernel"])
         betas = storage.load_body(config.body).shapedirs.shape[-1]
         poses = rows - config.model.latent - betas - (len(Material._fields) if config.material.sample else 0)
-        return (
-            config,
-            network["garment"],
-            network["predictor"],
-            Normalizers(identity(config.model.latent), identity(poses)),
-        )
+        normalizers = Normalizers(identity(config.model.latent), identity(poses))
+        garment, predictor = network["garment"], network["predictor"]
     else:
         directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
         parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
@@ -88,7 +84,7 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
         for trained_on in later:
             if checkpoint.steps(trained_on):
                 predictor = checkpoint.read(trained_on, "average")[0]["average"]
-    normalizers = Normalizers(*(Scale(**parts["normalizers"][name]) for name in Normalizers._fields))
+        normalizers = _normalizers(parts["normalizers"])
     return config, garment, predictor, normalizers
 
 
@@ -147,6 +143,14 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
     return (out / WEIGHTS).stat().st_size
 
 
+def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
+    return {name: Statistics(**each) for name, each in parts.items()}
+
+
+def _normalizers(parts: dict[str, dict]) -> Normalizers:
+    return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
+
+
 def _config(run: Path) -> Config:
     """The configuration of a run's last stage: those before may have been trained with other settings of later ones."""
     first, *later = (run / stage / "checkpoints" for stage in STAGES)
@@ -172,7 +176,13 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
                     node = node.setdefault(key, {})
                 node[last] = leaf.astype(np.float32)
         parts = checkpoint.lists(tree)
-        return config, {name: parts[name] for name in ("phi", "statistics", "predictor", "normalizers")}
+        parts["phi"]["garment"]  # all else of a model needs it
+        return config, {
+            "phi": parts["phi"],
+            "predictor": parts["predictor"],
+            "statistics": _statistics(parts["statistics"]),
+            "normalizers": _normalizers(parts["normalizers"]),
+        }
     except storage.UNREADABLE as error:
         raise ValueError(
             f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"

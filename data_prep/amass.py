@@ -39,7 +39,7 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
             poses, trans, fps = (np.asarray(file[key], np.float64) for key in ("poses", "trans", rate))
     except FileNotFoundError:
         raise
-    except (MemoryError, *UNREADABLE) as error:
+    except UNREADABLE as error:
         raise ValueError(f"{path}: not a motion of AMASS: {error}") from error
     if poses.ndim == 3:
         poses = poses.reshape(len(poses), -1)
@@ -51,7 +51,7 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
         wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(wrong):
             raise ValueError(f"{path}: {name} of frame {wrong[0]} is not finite: cut it out")
-    if fps.size != 1 or not 0 < float(fps) < 1e4:
+    if fps.size != 1 or not 0 < fps.item() < 1e4:
         raise ValueError(f"{path}: {rate} is {fps}, not a rate in Hz")
     poses = poses[:, : 3 * len(BODY)].reshape(-1, 3)
     rotations = Rotation.from_rotvec(poses).as_matrix().reshape(len(trans), len(BODY), 3, 3)
@@ -59,7 +59,7 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
         turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
         rotations[:, 0] = turn @ rotations[:, 0]
         trans = trans @ turn.T
-    return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, float(fps))
+    return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, fps.item())
 
 
 def carry(

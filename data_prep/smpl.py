@@ -96,7 +96,7 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
             found = {key: _array(whole[key]) for key in (*KEYS, "posedirs") if key in whole}
     except FileNotFoundError:
         raise
-    except (pickle.UnpicklingError, OverflowError, MemoryError, *UNREADABLE) as error:
+    except (pickle.UnpicklingError, *UNREADABLE) as error:
         raise ValueError(f"{path}: not a body model of the SMPL family: {error}") from error
     missing = [key for key in KEYS if key not in found]
     if missing:
