@@ -1,4 +1,4 @@
-"""A training that keeps a checkpoint after every call, which `test_killed.py` kills: python tests/killed.py CONFIG ..."""
+"""A training that keeps a checkpoint after every call, for `test_killed.py`: python tests/killed.py CONFIG ..."""
 
 import sys
 from functools import partial

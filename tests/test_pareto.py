@@ -56,7 +56,7 @@ def test_what_cannot_be_compared(tmp_path):
         benchmark.main(["tshirt", "--part", "inference"])
 
 
-@pytest.fixture(scope="module", params=["ncs", "snug"])
+@pytest.fixture(scope="module", params=["ncs", pytest.param("snug", marks=pytest.mark.slow)])
 def run(request, tmp_path_factory):
     """A peer's network trained for a moment, on the t-shirt's mean body."""
     config = settings(request.param, steps=20)

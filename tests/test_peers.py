@@ -16,7 +16,7 @@ from clothjax.config import Config, PeerConfig
 from clothjax.types import Pose
 from experiments import evaluate, train
 
-NETWORKS = ("ncs", "snug", "direct")
+NETWORKS = ("ncs", pytest.param("snug", marks=pytest.mark.slow), "direct")
 
 
 def settings(network: str, **stage) -> Config:
