@@ -142,8 +142,6 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
         sizes: dict[str, int] = {}
         poses = _floats(file, "poses", ("T", "J", 3), sizes).astype(np.float64)
         translation = _floats(file, "trans", ("T", 3), sizes, np.float64)
-        if not sizes["T"]:
-            raise ValueError(f"{file.filename}: dataset 'poses' has no frames")
         fps = file.attrs.get("fps")
         if not isinstance(fps, (int, float, np.number)) or not 0 < fps < np.inf:
             raise ValueError(f"{file.filename}: attribute 'fps' must be a number > 0, got {fps!r}")
@@ -257,7 +255,8 @@ def _dataset(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int]) ->
     found = file[name].shape
     wanted = tuple(sizes.get(n, n) for n in shape)
     if found[:1] == (0,):
-        raise ValueError(f"{file.filename}: dataset {name!r} is empty")
+        what = {"T": "frames", "J": "joints"}.get(shape[0], "rows")
+        raise ValueError(f"{file.filename}: dataset {name!r} is empty, there are no {what} in it")
     if len(found) != len(wanted) or any(isinstance(w, int) and w != f for f, w in zip(found, wanted)):
         text = ", ".join(f"{n} = {sizes[n]}" if n in sizes else str(n) for n in shape)
         raise ValueError(f"{file.filename}: dataset {name!r} has shape {found}, expected ({text})")
