@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from test_peers import settings
@@ -36,9 +37,10 @@ def test_what_wins_at_equal_time_and_at_equal_error():
 def test_the_order_of_two_runs():
     one = [point("psi", float(i), 10.0 - i, name=str(i)) for i in range(5)]
     same = [p | {"us": 3.0 * p["us"]} for p in one[::-1]]
-    assert pareto.rank_tau(one, [*same, point("ncs", 1.0, 1.0)]) == dict.fromkeys(("us", *pareto.ERRORS), 1.0)
+    found = pareto.rank_tau(one, [*same, point("ncs", 1.0, 1.0)])
+    assert set(found) == {"us", *pareto.ERRORS} and min(found.values()) == pytest.approx(1.0)
     swapped = [p | {"us": -p["us"]} for p in one]
-    assert pareto.rank_tau(one, swapped)["us"] == -1.0
+    assert pareto.rank_tau(one, swapped)["us"] == pytest.approx(-1.0)
 
 
 def test_no_point_is_better_than_one_on_the_front():
@@ -66,10 +68,14 @@ def run(request, tmp_path_factory):
     return folder
 
 
-def test_a_peers_graph_is_what_was_trained(run, tmp_path):
+def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
     stage = pareto._stage(run, ("walk_3",), 10)
     config, model = trained.phi(run)
     network = config.peer.network
+    # so short a training hardly moves the cloth
+    last = "blendshapes" if network == "ncs" else "output"
+    model["params"][last] = jax.tree.map(lambda x: 1000 * np.asarray(x), model["params"][last])
+    monkeypatch.setattr(trained, "phi", lambda _: (config, model))
     expected = _stages(stage.whole, model, run)[network](stage.character, stage.clips[0])()
     exact, rounded = pareto._peer(stage, run, tmp_path).values()
     np.testing.assert_allclose(exact.tracks[0], expected, atol=2e-5)
