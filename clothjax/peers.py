@@ -78,8 +78,8 @@ def inputs(
 
 
 def _facing(poses: Pose, root: int) -> Pose:
-    """A window of three poses, turned about the vertical so that the middle one faces ahead."""
-    turn = rotation.heading(poses.rotations[1, root]).T
+    """A window of three poses, turned about the vertical so that the last one faces ahead."""
+    turn = rotation.heading(poses.rotations[2, root]).T
     turned = jnp.matmul(turn[None], poses.rotations[:, root], precision="highest")
     advance = jnp.einsum("ab,nb->na", turn, poses.translation, precision="highest")
     return Pose(poses.rotations.at[:, root].set(turned), advance)

@@ -339,7 +339,7 @@ def main(args: Arguments) -> None:
         licence=args.licence,
     )
     if args.mesh is not None:
-        draw(args.output.with_suffix(".png"), garment, body)
+        draw(args.output.with_suffix(".garment.png"), garment, body)
     print(f"{args.output}: {len(garment.vertices)} vertices, {int(garment.pinned.sum())} pinned")
 
 

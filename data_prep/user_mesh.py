@@ -62,6 +62,8 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     Raises:
         ValueError: naming the file, the place in it, and what to do.
     """
+    if answers.vertices is not None and not FEWEST <= answers.vertices <= MOST:
+        raise ValueError(f"--vertices {answers.vertices}: {FEWEST} to {MOST} can be trained")
     mesh, said = read(path), []
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
     _check_place(path, mesh.vertices, surface, answers)

@@ -185,4 +185,4 @@ def test_the_program_writes_a_garment_and_its_picture(skirt, body, save, tmp_pat
     path = save(100 * skirt[0], skirt[1])
     program.main(program.Arguments(tmp_path / "mine.h5", mesh=path, units="cm", pin="highest"))
     assert storage.load_garment(tmp_path / "mine.h5", body).pinned.sum() > 20
-    assert (tmp_path / "mine.png").stat().st_size > 1e4 and "openings" in capsys.readouterr().out
+    assert (tmp_path / "mine.garment.png").stat().st_size > 1e4 and "openings" in capsys.readouterr().out

@@ -31,7 +31,7 @@ from experiments.train import load_phi
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-MOTIONS = ("walk_3", "dance_3")  # held out of training, and in the library
+MOTIONS = ("walk_3",)  # held out of training by every configuration
 DESCENT_STEPS = (1, 4, 16, 32)  # of Phi
 ITERATIONS = (1, 2, 4, 8, 500)  # of the solver, of which the last is until it has converged
 SHAPES = {"a half": 1 / 2, "a third": 1 / 3, "a sixth": 1 / 6, "a twelfth": 1 / 12}  # of Psi's blend shapes
@@ -91,10 +91,11 @@ def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tupl
 
 
 def wins(points: list[dict]) -> dict:
-    """Garments that have both, on which Psi beats NCS: in every error at no more time than NCS in its fastest form, and
-    in time at no more of any error than NCS in its best form.
+    """Garments that have both, on which Psi beats NCS in its fastest usable form: in every error at no more time, and
+    in time at no more of any error.
 
-    A form of NCS that errs by a tenth more than its best is not meant.
+    Usable are forms of NCS whose step errs by at most a tenth more than that of its best. Psi has forms that NCS is not
+    given here: fewer blend shapes, plain C.
     """
     won = {"wins_at_equal_time": [], "wins_at_equal_error": [], "compared": []}
     for garment in dict.fromkeys(point["garment"] for point in points):
