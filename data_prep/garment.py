@@ -24,7 +24,7 @@ from clothjax.storage import joint_names, load_body, save_garment
 from clothjax.types import Body, Garment
 from data_prep.diffusion import diffuse
 from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
-from data_prep.remesh import flip, relax, remesh
+from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
 from data_prep.user_mesh import FOREARM, Answers, Unit, Up, bring, draw
 from experiments.session import fail_clearly
@@ -116,14 +116,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
     if ((solid - nearest) * igl.per_vertex_normals(solid, triangles)).sum() < 0:
         triangles = triangles[:, ::-1]
 
-    # equilateral triangles: two faces of sqrt(3)/4 h^2 for each vertex
-    length = np.sqrt(igl.doublearea(solid, triangles).sum() / vertices / np.sqrt(3))
-    shape, faces = remesh(solid, triangles, length, 6)
-    for _ in range(4):
-        if abs(len(shape) / vertices - 1) < 0.03:
-            break
-        length *= np.sqrt(len(shape) / vertices)
-        shape, faces = remesh(shape, faces, length, 3)
+    shape, faces, _ = resample(solid, triangles, vertices)
     shape, faces = fit(shape, faces, wearer.vertices, wearer.faces)
     if len(boundary_loops(faces)) != kind.loops or components(faces, len(shape)).max() > 0:
         raise ValueError(

@@ -15,7 +15,7 @@ from clothjax import animation
 from clothjax.types import Body, Garment
 from data_prep.diffusion import diffuse
 from data_prep.mesh import boundary_loops, compact, components, edge_table
-from data_prep.remesh import remesh
+from data_prep.remesh import resample
 from data_prep.retarget import cmu_names
 
 Unit = Literal["m", "cm", "mm", "in", "ft"]
@@ -258,14 +258,7 @@ def _winding(faces: np.ndarray) -> np.ndarray:
 
 def _resampled(points, faces, marked, wanted: int, said: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface with about so many vertices, each of them pinned if the nearest before was."""
-    area = igl.doublearea(points, faces).sum()
-    length = np.sqrt(area / wanted / np.sqrt(3))
-    shape, triangles = remesh(points, faces, length, 6)
-    for _ in range(4):
-        if abs(len(shape) / wanted - 1) < 0.03:
-            break
-        length *= np.sqrt(len(shape) / wanted)
-        shape, triangles = remesh(shape, triangles, length, 3)
+    shape, triangles, length = resample(points, faces, wanted)
     said.append(f"remeshed: {len(points)} vertices to {len(shape)}, edges of {1e3 * length:.0f} mm")
     nearest = np.linalg.norm(shape[:, None] - points[marked][None], axis=-1).min(axis=1) if marked.any() else np.inf
     return shape, triangles, np.broadcast_to(nearest < 0.5 * length, len(shape)).copy()
