@@ -101,6 +101,8 @@ def pack(run: str | Path, out: str | Path) -> int:
     """
     _, garment, predictor, normalizers = psi(run)
     config, model = phi(run)
+    if config.peer.network:
+        raise ValueError(f"{run}: is of a peer's network ({config.peer.network}), which cannot be packed")
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
