@@ -5,6 +5,8 @@ import re
 import shutil
 from importlib import metadata
 
+from packaging.requirements import Requirement
+
 COMMANDS = {
     "data": "data_prep.anny: makes the embedded body anew",
     "export": "experiments.convert, experiments.benchmark: ONNX, safetensors",
@@ -23,32 +25,40 @@ PROGRAMS = {
 
 def report() -> tuple[list[str], bool]:
     """Lines for a person, and whether all is there that clothjax cannot do without."""
-    required, extras = requirements()
     lines = [f"clothjax {_version('clothjax')}, Python {platform.python_version()}, {platform.platform()}", ""]
-    missing = [name for name in required if _version(name) is None]
-    lines += [f"  {name:20} {_version(name) or 'MISSING'}" for name in required]
-    if missing:
-        lines += ["", f"broken: install what is missing: pip install {' '.join(missing)}"]
-        return lines, False
-    lines += ["", *_devices(), ""]
-    for extra, names in extras.items():
-        absent = [name for name in names if _version(name) is None]
+    try:
+        required, extras = requirements()
+    except metadata.PackageNotFoundError:
+        return [*lines, "broken: clothjax is not installed here, only its files: pip install -e ."], False
+    unmet = [wanted for wanted in required if not _met(wanted)]
+    lines += [f"  {wanted.name:20} {_state(wanted)}" for wanted in required]
+    if unmet:
+        command = " ".join(f"'{wanted.name}{wanted.specifier}'" for wanted in unmet)
+        return [*lines, "", f"broken: pip install {command}"], False
+    found, running = _devices()
+    lines += ["", found, ""]
+    for extra, wanted in extras.items():
+        absent = [each.name for each in wanted if not _met(each)]
         state = f"without {', '.join(absent)}: pip install 'clothjax[{extra}]'" if absent else "ready"
         lines.append(f"  {extra:8} {state:60} {COMMANDS.get(extra, '')}".rstrip())
     for program, (name, use) in PROGRAMS.items():
         found = shutil.which(program)
         lines.append(f"  {program:8} {found or f'{name} is not on the PATH':60} {use}")
     garments, sound = _garments()
-    return [*lines, "", *garments], sound
+    return [*lines, "", *garments], sound and running
 
 
-def requirements() -> tuple[list[str], dict[str, list[str]]]:
-    """Names of the packages that clothjax needs, and of those of each of its extras."""
+def requirements() -> tuple[list[Requirement], dict[str, list[Requirement]]]:
+    """The packages that clothjax needs, and those of each of its extras.
+
+    Raises:
+        importlib.metadata.PackageNotFoundError: if clothjax is not installed.
+    """
     required, extras = [], {}
     for line in metadata.requires("clothjax") or []:
-        name = re.match(r"[\w.-]+", line).group()
-        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
-        (extras.setdefault(extra.group(1), []) if extra else required).append(name)
+        wanted = Requirement(line)
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", str(wanted.marker))
+        (extras.setdefault(extra.group(1), []) if extra else required).append(wanted)
     return required, extras
 
 
@@ -59,14 +69,24 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _devices() -> list[str]:
+def _met(wanted: Requirement) -> bool:
+    version = _version(wanted.name)
+    return version is not None and wanted.specifier.contains(version, prereleases=True)
+
+
+def _state(wanted: Requirement) -> str:
+    version = _version(wanted.name)
+    return version if _met(wanted) else f"{version}, not {wanted.specifier}" if version else "MISSING"
+
+
+def _devices() -> tuple[str, bool]:
     import jax
 
     try:
         found = [f"{device.platform} ({device.device_kind})" for device in jax.devices()]
     except RuntimeError as error:
-        return [f"jax finds no device: {error}"]
-    return [f"jax runs on {', '.join(found)}"]
+        return f"broken: jax finds no device: {error}", False
+    return f"jax runs on {', '.join(found)}", True
 
 
 def _garments() -> tuple[list[str], bool]:

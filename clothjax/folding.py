@@ -194,25 +194,32 @@ def _rows(network: Network) -> Array:
 def _fewer_shapes(model: Model, count: int) -> Model:
     """Principal components of ordinary displacements in the place of the blend shapes; their mean goes into the
     template."""
-    network, weights = model.network, ordinary_weights(model).astype(np.float64)
+    mix, shapes, moved = principal_rows(ordinary_weights(model), np.asarray(model.network.shapes), count)
+    network = model.network._replace(shapes=jnp.asarray(shapes))
+    template = model.wearer.template + jnp.asarray(moved).reshape(3, -1)
+    if model.config.model.blendshape_relu:
+        network = network._replace(mix=mix)
+    else:
+        network = _mixed(network, mix)
+    return dataclasses.replace(model, network=network, wearer=model.wearer._replace(template=template))
+
+
+def principal_rows(weights: np.ndarray, shapes: np.ndarray, count: int) -> tuple[Layer, np.ndarray, np.ndarray]:
+    """Fewer rows in the place of blend shapes [K, N], the best for weights [n, K] that occur: the layer that gives
+    their weights, themselves [count, N], and what is to be added [N]."""
+    weights = weights.astype(np.float64)
     mean, spread = weights.mean(axis=0), np.cov(weights.T)
     root = np.linalg.cholesky(spread + UNSEEN * np.trace(spread) / len(mean) * np.eye(len(mean)))
     # weights are mean + u root^T with isotropic u: the rows that serve u best are principal in root^T shapes
-    unmixed = root.T @ np.asarray(network.shapes, np.float64)
+    unmixed = root.T @ shapes.astype(np.float64)
     chosen = np.linalg.eigh(unmixed @ unmixed.T)[1][:, -count:]
     # in coordinates that are not large and cancelled by others: eight bits could not hold these
     turned, upper = np.linalg.qr(np.linalg.solve(root.T, chosen))
     rows = upper @ chosen.T @ unmixed
     axes = np.linalg.eigh(rows @ rows.T)[1]
     mixing = turned @ axes
-    network = network._replace(shapes=jnp.asarray(axes.T @ rows, jnp.float32))
-    mix = Layer(jnp.asarray(mixing, jnp.float32), _product(-mean, mixing))
-    template = model.wearer.template + _product(mean, model.network.shapes).reshape(3, -1)
-    if model.config.model.blendshape_relu:
-        network = network._replace(mix=mix)
-    else:
-        network = _mixed(network, mix)
-    return dataclasses.replace(model, network=network, wearer=model.wearer._replace(template=template))
+    mix = Layer(*(jnp.asarray(x, jnp.float32) for x in (mixing, -mean @ mixing)))
+    return mix, (axes.T @ rows).astype(np.float32), (mean @ shapes).astype(np.float32)
 
 
 def _mixed(network: Network, mix: Layer) -> Network:

@@ -18,14 +18,14 @@ from clothjax.types import Array, Pose
 
 STATIC = (64, 128, 256)  # NCS's static encoder, before its last layer
 LOCAL = 32  # what NCS's dynamic encoder makes of each joint
-UNITS = 4  # SNUG's recurrent layers
+GRUS = 4  # SNUG's recurrent layers
 
 
 def memory_size(config: Config) -> int:
     """Numbers that a network carries from frame to frame."""
     if config.peer.network == "direct":
         return config.model.latent
-    return config.peer.width * (UNITS if config.peer.network == "snug" else 1)
+    return config.peer.width * (GRUS if config.peer.network == "snug" else 1)
 
 
 def init(key: Array, joints: int, constants: int, shapes: Array, config: Config) -> Params:
@@ -119,7 +119,7 @@ def _init_ncs(key: Array, joints: int, constants: int, vertices: int, config: Pe
         "static": layers((9 * joints + constants, *STATIC, width), True),
         "local": layers((12, LOCAL, LOCAL), False),
         "dynamic": layers((LOCAL * joints, width, width), False),
-        "unit": _init_unit(next(keys), width, width, bias=False),
+        "unit": _init_gru(next(keys), width, width, bias=False),
         "decoder": layers((width, width, width, config.blendshapes), True),
         "blendshapes": nn.initializers.glorot_normal()(next(keys), (config.blendshapes, 3 * vertices)),
     }
@@ -134,7 +134,7 @@ def _ncs(params: Params, memory: Array, static: Array, dynamic: Array) -> tuple[
     dynamic = dynamic.reshape(-1)
     for layer in params["dynamic"]:
         dynamic = nn.relu(dynamic @ layer["kernel"])
-    memory = _unit(params["unit"], memory, dynamic)
+    memory = _gru(params["unit"], memory, dynamic)
     code = static + memory
     for layer in params["decoder"]:
         code = nn.relu(dense(layer, code))
@@ -145,11 +145,11 @@ def _ncs(params: Params, memory: Array, static: Array, dynamic: Array) -> tuple[
 
 
 def _init_snug(key: Array, joints: int, constants: int, vertices: int, config: PeerConfig) -> Params:
-    *keys, last = jax.random.split(key, UNITS + 1)
+    *keys, last = jax.random.split(key, GRUS + 1)
     width = config.width
-    sizes = (6 * joints + 3 + constants, *(width,) * (UNITS - 1))
+    sizes = (6 * joints + 3 + constants, *(width,) * (GRUS - 1))
     return {
-        "units": [_init_unit(k, size, width, bias=True) for k, size in zip(keys, sizes)],
+        "units": [_init_gru(k, size, width, bias=True) for k, size in zip(keys, sizes)],
         "output": {
             "kernel": nn.initializers.glorot_normal()(last, (width, 3 * vertices)),
             "bias": jnp.zeros(3 * vertices),
@@ -160,8 +160,8 @@ def _init_snug(key: Array, joints: int, constants: int, vertices: int, config: P
 def _snug(params: Params, memory: Array, inputs: Array) -> tuple[Array, Array]:
     """Displacements [3 V] m and the states [4 W] of its units."""
     states = []
-    for unit, state in zip(params["units"], jnp.split(memory, UNITS)):
-        inputs = _unit(unit, state, inputs)
+    for unit, state in zip(params["units"], jnp.split(memory, GRUS)):
+        inputs = _gru(unit, state, inputs)
         states.append(inputs)
     return dense(params["output"], inputs), jnp.concatenate(states)
 
@@ -189,7 +189,7 @@ def _direct(params, memory, poses, joints, constants, parents, kept, config: Con
 # --- gated recurrent units ----------------------------------------------------------------------------------------
 
 
-def _init_unit(key: Array, inputs: int, width: int, *, bias: bool) -> Params:
+def _init_gru(key: Array, inputs: int, width: int, *, bias: bool) -> Params:
     first, second = jax.random.split(key)
     kernels = {
         "input": {"kernel": nn.initializers.glorot_uniform()(first, (inputs, 3 * width))},
@@ -198,7 +198,7 @@ def _init_unit(key: Array, inputs: int, width: int, *, bias: bool) -> Params:
     return {name: each | ({"bias": jnp.zeros(3 * width)} if bias else {}) for name, each in kernels.items()}
 
 
-def _unit(params: Params, state: Array, inputs: Array) -> Array:
+def _gru(params: Params, state: Array, inputs: Array) -> Array:
     """A gated recurrent unit (Cho et al. 2014), its reset gate after the product, with or without biases."""
 
     def product(name: str, x: Array) -> list[Array]:

@@ -40,8 +40,22 @@ def folder(name: str) -> Path:
 
 
 def phi(run: str | Path) -> tuple[Config, dict]:
-    """The configuration and the `params` and `statistics` of Phi, or of a peer's network in its place, of a run or a
-    packed model.
+    """The configuration and the `params` and `statistics` of Phi, of a run or a packed model.
+
+    Raises:
+        ValueError: if there is no readable one, as of a peer's run.
+    """
+    config, model = network(run)
+    if config.peer.network:
+        raise ValueError(
+            f"{run}: is of a peer's network ({config.peer.network}), which has no Phi: only experiments.evaluate and "
+            "experiments.benchmark use it"
+        )
+    return config, model
+
+
+def network(run: str | Path) -> tuple[Config, dict]:
+    """As `phi`, or a peer's network in its place.
 
     Raises:
         ValueError: if there is no readable one.
@@ -70,12 +84,12 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
     elif (config := _config(Path(run))).peer.network:
         if config.peer.network != "direct":
             raise ValueError(f"{run}: is of {config.peer.network}, which has no latent predictor to use")
-        network = phi(run)[1]["params"]
-        rows = len(network["predictor"]["dense_0"]["kernel"])
+        params = network(run)[1]["params"]
+        rows = len(params["predictor"]["dense_0"]["kernel"])
         betas = storage.load_body(config.body).shapedirs.shape[-1]
         poses = rows - config.model.latent - betas - (len(Material._fields) if config.material.sample else 0)
         normalizers = Normalizers(identity(config.model.latent), identity(poses))
-        garment, predictor = network["garment"], network["predictor"]
+        garment, predictor = params["garment"], params["predictor"]
     else:
         directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
         parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
@@ -99,10 +113,8 @@ def pack(run: str | Path, out: str | Path) -> int:
     Raises:
         ValueError: if the run is not finished, or Psi was trained on another Phi than the run now has.
     """
-    _, garment, predictor, normalizers = psi(run)
     config, model = phi(run)
-    if config.peer.network:
-        raise ValueError(f"{run}: is of a peer's network ({config.peer.network}), which cannot be packed")
+    _, garment, predictor, normalizers = psi(run)
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)

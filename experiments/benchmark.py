@@ -18,9 +18,11 @@ loop. `floor_us` is how long this machine takes to read as many bytes.
 
 `pareto` gives time and error, on one thread, of every way to move a garment: skinning, Psi and Phi in their variants,
 the solver stopped early, and runs of peers (`configs/ncs.yaml`). It takes folders of runs and names of shipped
-garments, by default all of these. Errors are those of `experiments.evaluate`, in closed loop on motions held out of
-training; `swing_error` is the rms error of the velocity of what skinning does not do, over the solver's. With
-`--compare OLD.json` it says whether two runs put the points in the same order (Kendall's tau).
+garments, by default all of these; what is compared on a garment must be trained for the same physics, wearers and
+motions. Phi and the solver are loops and take no turns: their times are of whole loops, or medians of their frames.
+Errors are those of `experiments.evaluate`, in closed loop on motions held out of training; `swing_error` is the rms
+error of the velocity of what skinning does not do, over the solver's. With `--compare OLD.json` it says whether two
+reports put the points in the same order (Kendall's tau).
 """
 
 import argparse

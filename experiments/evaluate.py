@@ -90,7 +90,7 @@ def pretrained(folders: dict[str, Path], motions: list[str] | None = None) -> di
     for name, folder in folders.items():
         there = motions
         if there is None:
-            wanted = trained.phi(folder)[0].evaluation.motions
+            wanted = trained.network(folder)[0].evaluation.motions
             there = [motion for motion in wanted if storage.asset(motion).is_file()]
             print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
         reports[name] = evaluate(folder, there)
@@ -110,7 +110,7 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     Args:
         settings: default: those that the run was trained with.
     """
-    whole, model = load_phi(run, settings)
+    whole, model = load_phi(run, settings, trained.network)
     kept(run).mkdir(parents=True, exist_ok=True)
     config = whole.config
     betas = experiment.betas(config)

@@ -17,6 +17,7 @@ import dataclasses
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -277,13 +278,16 @@ def _spent(directory: Path, **seconds: float) -> dict[str, float]:
 DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning", "refinement")
 
 
-def load_phi(directory: Path, evaluation: EvaluationConfig | None = None) -> tuple[experiment.Experiment, dict]:
+def load_phi(
+    directory: Path, evaluation: EvaluationConfig | None = None, read: Callable = trained.phi
+) -> tuple[experiment.Experiment, dict]:
     """Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`.
 
     Args:
         evaluation: in the place of what the run was trained with.
+        read: `trained.network` takes a peer's network too.
     """
-    config, model = trained.phi(directory)
+    config, model = read(directory)
     return experiment.assemble(dataclasses.replace(config, evaluation=evaluation or config.evaluation)), model
 
 

@@ -14,7 +14,7 @@ from clothjax import character as characters
 from clothjax import clips as motion
 from clothjax.config import Config, PeerConfig
 from clothjax.types import Pose
-from experiments import evaluate, train
+from experiments import evaluate, gallery, render, train
 
 NETWORKS = ("ncs", pytest.param("snug", marks=pytest.mark.slow), "direct")
 
@@ -80,8 +80,19 @@ def test_ncs_sees_rates_of_rotations(chain):
     np.testing.assert_allclose(dynamic[0], 0.0, atol=1e-5)
 
 
+def test_only_the_dynamic_inputs_know_of_earlier_frames(chain):
+    joints, parents, kept = chain
+    turns = jnp.asarray([[about_y(0.3 * t), np.eye(3)] for t in range(3)], jnp.float32)
+    turning = Pose(turns, jnp.asarray([[0.1 * t, 1.0, 0.0] for t in range(3)], jnp.float32))
+    still = Pose(jnp.stack([turns[2]] * 3), jnp.stack([turning.translation[2]] * 3))
+    config, constants = settings("ncs"), jnp.zeros(3)
+    moved, resting = (peers.inputs(poses, joints, constants, parents, kept, config) for poses in (turning, still))
+    np.testing.assert_allclose(moved["static"], resting["static"], atol=1e-6)
+    assert np.abs(moved["dynamic"]).max() > 1.0 and np.abs(resting["dynamic"]).max() < 1e-4
+
+
 def test_the_unit_is_flaxs():
-    params = peers._init_unit(jax.random.key(0), 5, 4, bias=True)
+    params = peers._init_gru(jax.random.key(0), 5, 4, bias=True)
     params["input"]["bias"] = jax.random.normal(jax.random.key(1), (12,))
     rows = jax.random.normal(jax.random.key(2), (6, 5))
     cell = nn.GRUCell(4)
@@ -95,7 +106,7 @@ def test_the_unit_is_flaxs():
     theirs["hn"]["bias"] = jnp.zeros(4)
     one = other = jnp.zeros(4)
     for row in rows:
-        one = peers._unit(params, one, row)
+        one = peers._gru(params, one, row)
         other, _ = cell.apply({"params": theirs}, other, row)
     np.testing.assert_allclose(one, other, atol=1e-6)
     assert np.abs(one).max() > 0.1
@@ -180,12 +191,15 @@ def test_it_is_trained_measured_and_read_back_as_an_experiment(tmp_path):
         config, evaluation=dataclasses.replace(config.evaluation, frames=24, long_frames=26, solver_frames=20)
     )
     train.train(config, tmp_path)
-    read, model = trained.phi(tmp_path)
+    read, model = trained.network(tmp_path)
     assert read.peer == config.peer and model["params"]["blendshapes"].shape == (9, 3 * 1016)
     report = evaluate.evaluate(tmp_path)
     assert set(report["evaluation"]) == {"lbs", "ncs"}
     assert np.isfinite(report["evaluation"]["ncs"]["energy_gap"]) and report["evaluation"]["ncs"]["finite"]
     assert "ncs" in evaluate.table(report["evaluation"])
+    for program in (render, gallery):
+        with pytest.raises(ValueError, match=r"ncs.*has no Phi"):
+            program.main([str(tmp_path), "--out", str(tmp_path / "picture.webp")])
 
 
 def test_a_long_first_step_is_refused():

@@ -1,4 +1,4 @@
-"""Error against time of every way to move a garment: Psi and Phi in their variants, peers, the solver, skinning."""
+"""Error against time of all that can move a garment: Psi and Phi in their variants, peers, the solver, skinning."""
 
 import dataclasses
 import tempfile
@@ -14,7 +14,18 @@ import numpy as np
 from scipy.stats import kendalltau
 
 from clothjax import character as characters
-from clothjax import experiment, folding, inference, latent_predictor, metrics, rollout, simulation, skinning, trained
+from clothjax import (
+    experiment,
+    folding,
+    inference,
+    latent_predictor,
+    metrics,
+    rollout,
+    simulation,
+    skinning,
+    storage,
+    trained,
+)
 from clothjax import peers as networks
 from clothjax.character import Character
 from clothjax.config import Config
@@ -31,10 +42,11 @@ from experiments.train import load_phi
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-MOTIONS = ("walk_3",)  # held out of training by every configuration
 DESCENT_STEPS = (1, 4, 16, 32)  # of Phi
 ITERATIONS = (1, 2, 4, 8, 500)  # of the solver, of which the last is until it has converged
-SHAPES = {"a half": 1 / 2, "a third": 1 / 3, "a sixth": 1 / 6, "a twelfth": 1 / 12}  # of Psi's blend shapes
+SHAPES = {"a half": 1 / 2, "a quarter": 1 / 4, "an eighth": 1 / 8}  # of the blend shapes
+USABLE = 1.1  # errors of NCS in a smaller form, over those of the form that was trained
+ALIKE = ("body", "fps", "physics", "material", "motions")  # of the configurations of what is compared
 ERRORS = {
     "energy_gap": "energy gap: 0 the solver, 1 skinning",
     "step_error_mm": "distance to the solver's step, mm",
@@ -44,45 +56,53 @@ COLOURS = {
     "skinning": "gray", "psi": "tab:blue", "phi": "tab:green", "ncs": "tab:red", "snug": "tab:orange",
     "direct": "tab:purple", "solver": "black",
 }  # fmt: skip
+MARKERS = {"onnx": "o", "c": "^", "jax": "s"}
 LEAST = {"energy_gap": 1e-5, "step_error_mm": 1e-3, "swing_error": 1e-3}  # where the plots begin
 
 
-class Way(NamedTuple):
-    """A way to move a garment."""
+class Variant(NamedTuple):
+    """Something that moves a garment."""
 
     family: str  # of COLOURS
+    runtime: str  # of MARKERS
     tracks: list[np.ndarray]  # closed loops [T - 2, V, 3] m over each of the clips, relative to the root
     call: Call | None  # one frame of it, to be timed beside the others
     us: float = 0.0  # a frame of the loop, where there is no `call`
+    converged: float = 1.0  # share of a solver's frames
 
 
-class Stage(NamedTuple):
-    """What the ways of a garment have in common."""
+class Case(NamedTuple):
+    """What the variants of a garment have in common."""
 
     whole: Experiment
     character: Character
     clips: list[Motion]
 
 
-def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tuple[str, ...] = MOTIONS) -> dict:
-    """Points of all runs, and what wins where a garment has a run of NCS beside one of Psi.
+def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tuple[str, ...] = ()) -> dict:
+    """Points of all runs, and what wins where a garment has runs of NCS beside runs of Psi.
 
     Args:
         runs: folders of runs and of packed models; those of one garment are compared with each other.
         frames: of each motion; gaps: of them, at how many the solver is asked.
+        motions: default: those on which all runs of a garment are evaluated.
+
+    Raises:
+        ValueError: if runs of a garment differ in body, physics, cloth or motions.
     """
     garments: dict[str, list[Path]] = {}
-    for run in runs:
-        garments.setdefault(trained.phi(run)[0].garment, []).append(run)
+    for run in dict.fromkeys(runs):
+        garments.setdefault(trained.network(run)[0].garment, []).append(run)
+    cases = [_case(of_it, motions, frames) for of_it in garments.values()]
     points = []
     with progress("garments", len(garments)) as report, tempfile.TemporaryDirectory() as folder:
-        for index, (garment, of_it) in enumerate(garments.items()):
-            stage = _stage(of_it[0], motions, frames)
-            ways, solved = _every(stage, of_it, Path(folder))
-            us = interleaved({name: way.call for name, way in ways.items() if way.call}, rounds)
-            for name, way in ways.items():
-                found = {"name": name, "family": way.family, "garment": garment, "us": us.get(name, way.us)}
-                points.append(found | _errors(stage, way.tracks, solved, gaps))
+        for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items())):
+            variants, solved = _every(case, of_it, Path(folder))
+            us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
+            for key, each in variants.items():
+                found = {"name": key[1], "run": key[0], "family": each.family, "garment": garment}
+                found |= {"runtime": each.runtime, "us": us.get(key, each.us), "converged": each.converged}
+                points.append(found | _errors(case, each.tracks, solved, gaps))
             report(index + 1)
     for point in points:
         others = [p for p in points if p["garment"] == point["garment"]]
@@ -91,36 +111,47 @@ def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tupl
 
 
 def wins(points: list[dict]) -> dict:
-    """Garments that have both, on which Psi beats NCS in its fastest usable form: in every error at no more time, and
-    in time at no more of any error.
+    """Garments that have both, on which Psi beats NCS: in every error at no more time than NCS takes, and in time at
+    no more of any error.
 
-    Usable are forms of NCS whose step errs by at most a tenth more than that of its best. Psi has forms that NCS is not
-    given here: fewer blend shapes, plain C.
+    Both are in ONNX Runtime, and in forms of the same kinds: as trained, with fewer blend shapes, in eight bits. NCS is
+    taken in the fastest whose errors are at most USABLE times those of the form that was trained. Of several runs
+    (seeds) the medians of a form are compared.
     """
     won = {"wins_at_equal_time": [], "wins_at_equal_error": [], "compared": []}
     for garment in dict.fromkeys(point["garment"] for point in points):
         ours, theirs = (
-            [p for p in points if p["garment"] == garment and p["family"] == family] for family in ("psi", "ncs")
+            _medians([p for p in points if (p["garment"], p["family"], p["runtime"]) == (garment, family, "onnx")])
+            for family in ("psi", "ncs")
         )
         if not (ours and theirs):
             continue
         won["compared"].append(garment)
-        least = min(p["step_error_mm"] for p in theirs)
-        usable = [p for p in theirs if p["step_error_mm"] <= 1.1 * least]
+        whole = theirs["ncs"]
+        usable = [p for p in theirs.values() if all(p[error] <= USABLE * whole[error] for error in ERRORS)]
         fastest = min(usable, key=lambda p: p["us"])
-        in_time = [p for p in ours if p["us"] <= fastest["us"]]
+        in_time = [p for p in ours.values() if p["us"] <= fastest["us"]]
         if any(all(p[error] < fastest[error] for error in ERRORS) for p in in_time):
             won["wins_at_equal_time"].append(garment)
-        as_good = [p for p in ours if all(p[error] <= fastest[error] for error in ERRORS)]
+        as_good = [p for p in ours.values() if all(p[error] <= fastest[error] for error in ERRORS)]
         if any(p["us"] < fastest["us"] for p in as_good):
             won["wins_at_equal_error"].append(garment)
     return won
 
 
+def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
+    """Time and errors of each form, by name, over the runs that have it."""
+    names = dict.fromkeys(p["name"] for p in points)
+    return {
+        name: {key: float(np.median([p[key] for p in points if p["name"] == name])) for key in ("us", *ERRORS)}
+        for name in names
+    }
+
+
 def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float]:
-    """Kendall's tau of the order of the points that two runs have in common, by time and by each error."""
-    named = {(p["garment"], p["name"]): p for p in others}
-    pairs = [(p, named[p["garment"], p["name"]]) for p in points if (p["garment"], p["name"]) in named]
+    """Kendall's tau of the order of the points that two reports have in common, by time and by each error."""
+    named = {(p["garment"], p["run"], p["name"]): p for p in others}
+    pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
     return {
         key: float(kendalltau([one[key] for one, _ in pairs], [other[key] for _, other in pairs]).statistic)
         for key in ("us", *ERRORS)
@@ -133,67 +164,81 @@ def _better(one: dict, other: dict, error: str) -> bool:
     return no_worse and (one["us"], one[error]) != (other["us"], other[error])
 
 
-def _stage(run: Path, motions: tuple[str, ...], frames: int) -> Stage:
-    whole, _ = load_phi(run)
-    config = whole.config
-    character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(
-        jnp.asarray(experiment.betas(config)), experiment.material(config)
+def _case(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
+    """What runs of a garment have in common: the wearer and the motions of the first one's evaluation."""
+    configs = [trained.network(run)[0] for run in runs]
+    first = configs[0]
+    wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
+    for run, config, wearer in zip(runs, configs, wearers):
+        differing = [name for name in ALIKE if getattr(config, name) != getattr(first, name)]
+        differing += ["betas"] * (wearer != wearers[0])
+        if differing:
+            raise ValueError(
+                f"{run}: trained with another {' and '.join(differing)} than {runs[0]}: what is compared on a garment "
+                "has to be trained for the same"
+            )
+    shared = [name for name in first.evaluation.motions if all(name in c.evaluation.motions for c in configs)]
+    names = motions or [name for name in shared if storage.asset(name).is_file()]
+    if not names:
+        raise ValueError(f"{', '.join(map(str, runs))}: no motion is held out by all of them")
+    whole, _ = load_phi(runs[0], None, trained.network)
+    character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, first.physics))(
+        jnp.asarray(experiment.betas(first)), experiment.material(first)
     )
-    clips = [experiment.motion(whole, name) for name in motions]
+    clips = [experiment.motion(whole, name) for name in names]
     clips = [Motion(clip.rotations[: frames + 2], clip.translation[: frames + 2], clip.fps) for clip in clips]
-    return Stage(whole, character, clips)
+    return Case(whole, character, clips)
 
 
-def _every(stage: Stage, runs: list[Path], folder: Path) -> tuple[dict[str, Way], list[np.ndarray]]:
-    """All ways to move one garment, and the solver's own loops."""
-    ways = {"skinning": _skinning(stage, folder)}
+def _every(case: Case, runs: list[Path], folder: Path) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
+    """All variants of one garment by run and name, and the solver's own loops."""
+    variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
-        config = trained.phi(run)[0]
-        label = "" if trained.packed(run) else f"{run.name}: "
-        network = config.peer.network
+        network = trained.network(run)[0].peer.network
         if network in ("ncs", "snug"):
-            ways |= {label + name: way for name, way in _peer(stage, run, folder).items()}
-            continue
-        ways |= {label + name: way for name, way in _psi(stage, run, network or "psi", folder).items()}
-        if not network:
-            ways |= {label + name: way for name, way in _phi(stage, run).items()}
-    solver, solved = _solver(stage)
-    return ways | solver, solved
+            found = _peer(case, run, folder)
+        else:
+            found = _psi(case, run, network or "psi", folder)
+            found |= {} if network else _phi(case, run)
+        variants |= {(str(run), name): each for name, each in found.items()}
+    solver, solved = _solver(case)
+    return variants | {("", name): each for name, each in solver.items()}, solved
 
 
-def _skinning(stage: Stage, folder: Path) -> Way:
-    whole = stage.whole
+def _skinning(case: Case, folder: Path) -> Variant:
+    whole = case.whole
     weights, _ = _moving(whole)
     g, path = Graph(), folder / "skinning.onnx"
-    rest = np.asarray(stage.character.template, np.float32).T.reshape(1, -1)
+    rest = np.asarray(case.character.template, np.float32).T.reshape(1, -1)
     garment = g("Identity", g.constant(rest))
     g("Transpose", g.skinned(garment, "transforms", weights), perm=[0, 2, 1], name="vertices")
     g.save(path, {"transforms": (1, len(weights), 12)}, {"vertices": (1, weights.shape[1], 3)})
-    tracks = [skinned_trajectory(whole, stage.character, windows(clip)) for clip in stage.clips]
-    return Way("skinning", tracks, bound(path, peers.feed(path)))
+    tracks = [skinned_trajectory(whole, case.character, windows(clip)) for clip in case.clips]
+    return Variant("skinning", "onnx", tracks, bound(path, peers.feed(path)))
 
 
-def _psi(stage: Stage, run: Path, family: str, folder: Path) -> dict[str, Way]:
+def _psi(case: Case, run: Path, family: str, folder: Path) -> dict[str, Variant]:
     """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer."""
-    betas = np.asarray(stage.character.betas)
-    model = inference.load(run, betas=betas)
+    folder = Path(tempfile.mkdtemp(dir=folder))
+    model = inference.load(run, betas=np.asarray(case.character.betas))
     count = len(model.network.shapes)
-    forms = {f"{family}, as trained": model, f"{family}, specialised": folding.specialise(model)}
+    forms = {family: folding.specialise(model)}
     forms |= {
         f"{family}, {name} of the shapes": folding.specialise(model, blendshapes=max(1, int(part * count)))
         for name, part in SHAPES.items()
     }
-    library, ways = native.build(folder) if native.compiler() else None, {}
+    library, variants = native.build(folder) if native.compiler() else None, {}
     for name, form in forms.items():
         for int8 in (False, True):
-            path = onnx.to_onnx(form, folder / f"{len(ways)}.onnx", int8=int8)
-            tracks = [_local(lambda m, p=path, f=form: onnx.run_onnx(p, f, m), clip) for clip in stage.clips]
-            ways[f"{name}, int8" if int8 else name] = Way(family, tracks, onnx_call(path, form))
-        if library and form is not model:
-            path = native.to_c(form, folder / f"{len(ways)}.psi")
-            tracks = [_local(lambda m, p=path: native.run_c(library, p, m), clip) for clip in stage.clips]
-            ways[f"{name}, C"] = Way(family, tracks, c_call(library, path, form))
-    return ways
+            path = onnx.to_onnx(form, folder / f"{len(variants)}.onnx", int8=int8)
+            tracks = [_local(lambda m, p=path, f=form: onnx.run_onnx(p, f, m), clip) for clip in case.clips]
+            label = f"{name}, int8" if int8 else name
+            variants[label] = Variant(family, "onnx", tracks, onnx_call(path, form))
+        if library:
+            path = native.to_c(form, folder / f"{len(variants)}.psi")
+            tracks = [_local(lambda m, p=path: native.run_c(library, p, m), clip) for clip in case.clips]
+            variants[f"{name}, C"] = Variant(family, "c", tracks, c_call(library, path, form))
+    return variants
 
 
 def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
@@ -203,40 +248,40 @@ def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
     return run(local) - local.translation[:, None]
 
 
-def _phi(stage: Stage, run: Path) -> dict[str, Way]:
+def _phi(case: Case, run: Path) -> dict[str, Variant]:
     """Phi with more and fewer steps of its descent, in jax."""
     config, model = trained.phi(run)
     if config.model.latent_update != "descent":
-        return {"phi": _loop(stage, config, model)}
+        return {"phi": _loop(case, config, model)}
     varied = {
         n: dataclasses.replace(config, model=dataclasses.replace(config.model, descent_steps=n)) for n in DESCENT_STEPS
     }
-    return {f"phi, {n} steps": _loop(stage, each, model) for n, each in varied.items()}
+    return {f"phi, {n} steps": _loop(case, each, model) for n, each in varied.items()}
 
 
-def _loop(stage: Stage, config: Config, model: dict) -> Way:
+def _loop(case: Case, config: Config, model: dict) -> Variant:
     """Phi's closed loop in jax, timed as a whole."""
-    scene, tracks, us = stage.whole.scene, [], []
+    scene, tracks, us = case.whole.scene, [], []
     run = jax.jit(lambda m, c, p: rollout.play(m, scene, c, p, config)[1].position)
-    for clip in stage.clips:
+    for clip in case.clips:
         poses = windows(clip)
-        jax.block_until_ready(run(model, stage.character, poses))  # compiles where the clip is of another length
+        jax.block_until_ready(run(model, case.character, poses))  # compiles where the clip is of another length
         began = time.perf_counter()
-        tracks.append(np.asarray(run(model, stage.character, poses)))
+        tracks.append(np.asarray(run(model, case.character, poses)))
         us.append(1e6 * (time.perf_counter() - began) / len(tracks[-1]))
-    return Way("phi", tracks, None, float(np.median(us)))
+    return Variant("phi", "jax", tracks, None, float(np.median(us)))
 
 
-def _peer(stage: Stage, run: Path, folder: Path) -> dict[str, Way]:
-    """NCS or SNUG's network in ONNX Runtime."""
-    whole, character = stage.whole, stage.character
-    config, model = trained.phi(run)
+def _peer(case: Case, run: Path, folder: Path) -> dict[str, Variant]:
+    """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
+    folder = Path(tempfile.mkdtemp(dir=folder))
+    whole, character = case.whole, case.character
+    config, model = trained.network(run)
     network = config.peer.network
     kept = latent_predictor.kept_joints(whole.names, config.stage2)
     weights, moving = _moving(whole)
-    template = np.asarray(character.template)
-    made = peers.Peer(network, model["params"], template, weights, ~np.asarray(whole.scene.garment.pinned))
-    ways = {}
+    free = ~np.asarray(whole.scene.garment.pinned)
+    peer = peers.made(network, model["params"], np.asarray(character.template), weights, free)
     constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
 
     @jax.jit
@@ -249,44 +294,61 @@ def _peer(stage: Stage, run: Path, folder: Path) -> dict[str, Way]:
 
         return jax.lax.map(one, poses)
 
-    for int8 in (False, True):
-        path, tracks = peers.write(folder / f"{network}{int8}.onnx", made, int8=int8), []
-        for clip in stage.clips:
-            poses = windows(clip)
-            seen = {name: np.asarray(x) for name, x in inputs(poses).items()}
-            count = len(poses.translation)
-            vertices = peers.run(path, [{name: x[t] for name, x in seen.items()} for t in range(count)])
-            first = skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:1], poses))
-            tracks.append(np.concatenate([first, vertices[:-1]]))
-        ways[f"{network}, int8" if int8 else network] = Way(network, tracks, bound(path, peers.feed(path)))
-    return ways
+    def frames(clip: Motion) -> list[dict[str, np.ndarray]]:
+        seen = {name: np.asarray(x) for name, x in inputs(windows(clip)).items()}
+        return [{name: x[t] for name, x in seen.items()} for t in range(len(clip.translation) - 2)]
+
+    coding = peers.write(folder / "codes.onnx", peer, whole=False)
+    usual = [experiment.motion(whole, name) for name in folding.CLIPS]
+    codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])
+    forms = {network: peer}
+    forms |= {
+        f"{network}, {name} of the shapes": peers.fewer(peer, codes, max(1, int(part * codes.shape[1])))
+        for name, part in SHAPES.items()
+    }
+    variants, seen = {}, [frames(clip) for clip in case.clips]
+    first = [skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:1], windows(c))) for c in case.clips]
+    for name, form in forms.items():
+        for int8 in (False, True):
+            path = peers.write(folder / f"{len(variants)}.onnx", form, int8=int8)
+            tracks = [np.concatenate([start, peers.run(path, of)[:-1]]) for start, of in zip(first, seen)]
+            label = f"{name}, int8" if int8 else name
+            variants[label] = Variant(network, "onnx", tracks, bound(path, peers.feed(path)))
+    return variants
 
 
-def _solver(stage: Stage) -> tuple[dict[str, Way], list[np.ndarray]]:
+def _solver(case: Case) -> tuple[dict[str, Variant], list[np.ndarray]]:
     """The reference solver, stopped after some iterations; and its loops when it is not."""
-    whole, ways, solved = stage.whole, {}, []
+    whole, variants, solved = case.whole, {}, []
     for iterations in ITERATIONS:
-        tracks, us = [], []
-        for clip in stage.clips:
-            poses = windows(clip)
-            began = time.perf_counter()
-            track, _ = simulation.simulate(whole.scene, stage.character, poses, whole.config, max_iterations=iterations)
-            us.append(1e6 * (time.perf_counter() - began) / len(track))
+        tracks, us, converged = [], [], []
+        for clip in case.clips:
+            clock = [time.perf_counter()]
+            track, infos = simulation.simulate(
+                whole.scene,
+                case.character,
+                windows(clip),
+                whole.config,
+                max_iterations=iterations,
+                progress=lambda _, ticks=clock: ticks.append(time.perf_counter()),
+            )
+            us.append(1e6 * np.median(np.diff(clock)))  # the first frame compiles
             tracks.append(track[:-1])
+            converged += [bool(info.converged) for info in infos]
         last = iterations == ITERATIONS[-1]
         name = "solver" if last else f"solver, {iterations} iteration{'s' * (iterations > 1)}"
-        ways[name] = Way("solver", tracks, None, float(np.median(us)))
+        variants[name] = Variant("solver", "jax", tracks, None, float(np.median(us)), float(np.mean(converged)))
         solved = tracks
-    return ways, solved
+    return variants, solved
 
 
-def _errors(stage: Stage, tracks: list[np.ndarray], solved: list[np.ndarray], gaps: int) -> dict[str, float]:
-    whole, measures, swings = stage.whole, [], []
-    for clip, track, reference in zip(stage.clips, tracks, solved, strict=True):
+def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps: int) -> dict[str, float]:
+    whole, measures, swings = case.whole, [], []
+    for clip, track, reference in zip(case.clips, tracks, solved, strict=True):
         poses = windows(clip)
         frames = np.unique(np.linspace(SETTLING, len(track) - 2, gaps).astype(int))
-        measures += metrics.step_measures(whole.scene, stage.character, jnp.asarray(track), poses, frames, whole.config)
-        skinned = skinned_trajectory(whole, stage.character, poses)
+        measures += metrics.step_measures(whole.scene, case.character, jnp.asarray(track), poses, frames, whole.config)
+        skinned = skinned_trajectory(whole, case.character, poses)
         beside = metrics.beside_solver(whole.scene, *(x[SETTLING:] for x in (track, reference, skinned)))
         ratio, correlation = beside["swing_ratio"], beside["swing_correlation"]
         swings.append(ratio**2 + 1.0 - 2.0 * ratio * correlation)  # of |a - b|^2 / |b|^2
@@ -315,10 +377,11 @@ def plot(report: dict, path: Path) -> None:
     for row, garment in zip(axes, garments):
         of_it = [point for point in points if point["garment"] == garment]
         for axis, (error, label) in zip(row, ERRORS.items()):
-            for family in dict.fromkeys(point["family"] for point in of_it):
-                chosen = [point for point in of_it if point["family"] == family]
+            for family, runtime in dict.fromkeys((point["family"], point["runtime"]) for point in of_it):
+                chosen = [point for point in of_it if (point["family"], point["runtime"]) == (family, runtime)]
                 where = [p["us"] for p in chosen], [max(p[error], LEAST[error]) for p in chosen]
-                axis.loglog(*where, "o", ms=5, label=family, color=COLOURS[family])
+                style = {"ms": 5, "alpha": 0.8, "color": COLOURS[family], "label": f"{family} ({runtime})"}
+                axis.loglog(*where, MARKERS[runtime], **style)
             front = sorted((p["us"], max(p[error], LEAST[error])) for p in of_it if p["front"][error])
             axis.step(*zip(*front), color="black", lw=0.8, where="post")
             axis.set(xlabel="us a frame", ylabel=label, title=garment)

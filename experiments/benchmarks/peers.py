@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import peers
+from clothjax import folding, peers
 from clothjax.config import Config, PeerConfig, Stage1Config
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.graph_network import Params
@@ -24,6 +24,8 @@ class Peer(NamedTuple):
 
     network: str  # ncs or snug
     params: Params
+    shapes: Layer  # from the network's code to displacements [3 V] m
+    mix: Layer | None  # before it, where there are fewer shapes than the code is long
     template: np.ndarray  # [V, 3] m
     weights: np.ndarray  # [J, V] skinning weights
     free: np.ndarray  # [V] false where pinned
@@ -35,7 +37,23 @@ def published(vertices: int) -> Peer:
     params = jax.jit(lambda k: peers.init(k, JOINTS, 0, jnp.zeros((1, vertices, 3)), config))(jax.random.key(0))
     random = np.random.default_rng(0)
     weights = random.dirichlet(np.ones(JOINTS), vertices).T
-    return Peer("ncs", params, random.standard_normal((vertices, 3)), weights, np.ones(vertices, bool))
+    return made("ncs", params, random.standard_normal((vertices, 3)), weights, np.ones(vertices, bool))
+
+
+def made(network: str, params: Params, template: np.ndarray, weights: np.ndarray, free: np.ndarray) -> Peer:
+    """A network with all its shapes; arguments as in `Peer`."""
+    params = jax.tree.map(np.asarray, params)
+    if network == "ncs":
+        shapes = Layer(params["blendshapes"], np.zeros(params["blendshapes"].shape[1], np.float32))
+    else:
+        shapes = Layer(**params["output"])
+    return Peer(network, params, shapes, None, template, weights, free)
+
+
+def fewer(peer: Peer, codes: np.ndarray, count: int) -> Peer:
+    """With so many shapes, the principal ones for codes [n, K] that occur: what Psi is given by `folding`."""
+    mix, rows, moved = folding.principal_rows(codes, peer.shapes.kernel, count)
+    return peer._replace(mix=mix, shapes=Layer(rows, peer.shapes.bias + moved))
 
 
 def write(path: Path, peer: Peer, *, int8: bool = False, whole: bool = True) -> Path:
@@ -44,13 +62,13 @@ def write(path: Path, peer: Peer, *, int8: bool = False, whole: bool = True) -> 
     Its inputs are `hidden` [1, M], and of NCS `static` [1, S] and `dynamic` [J, 12], of SNUG `inputs` [1, N]; whole,
     also `transforms` [1, J, 12]. Its outputs are `next_hidden`, and `vertices` [1, V, 3] or `code`.
     """
-    g, params = Graph(int8), jax.tree.map(np.asarray, peer.params)
+    g, params = Graph(int8), peer.params
     if peer.network == "ncs":
-        units, last = [params["unit"]], Layer(params["blendshapes"], np.zeros(params["blendshapes"].shape[1]))
+        units = [params["unit"]]
         locals_, joints = params["local"], params["dynamic"][0]["kernel"].shape[0] // peers.LOCAL
         given = {"static": (1, len(params["static"][0]["kernel"])), "dynamic": (joints, len(locals_[0]["kernel"]))}
     else:
-        units, last = params["units"], Layer(**params["output"])
+        units = params["units"]
         given = {"inputs": (1, len(units[0]["input"]["kernel"]))}
     width = len(units[0]["state"]["kernel"])
     given["hidden"] = (1, len(units) * width)
@@ -59,11 +77,12 @@ def write(path: Path, peer: Peer, *, int8: bool = False, whole: bool = True) -> 
     if whole:
         given["transforms"] = (1, len(peer.weights), 12)
         found["vertices"] = (1, len(peer.template), 3)
-        garment = g.layer(code, _by_coordinate(last, peer))
+        code = g.layer(code, peer.mix) if peer.mix else code
+        garment = g.layer(code, _by_coordinate(peer))
         moved = g.skinned(garment, "transforms", peer.weights.astype(np.float32))
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")
     else:
-        found["code"] = (1, last.kernel.shape[0])
+        found["code"] = (1, len(peer.shapes.kernel))
         g("Identity", code, name="code")
     g.save(path, given, found)
     return path
@@ -76,28 +95,30 @@ def feed(path: Path) -> dict[str, np.ndarray]:
 
 
 def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Vertices [T, V, 3] m of a closed loop.
+    """Vertices [T, V, 3] m of a closed loop; of a graph that is not whole, codes [T, K].
 
     Args:
-        inputs: of each frame, but for `hidden`.
+        inputs: of each frame, but for `hidden`; what the graph does not read is left out.
     """
-    one, vertices = session(path), []
+    one, found = session(path), []
+    read, last = {value.name for value in one.get_inputs()}, one.get_outputs()[-1].name
     hidden = np.zeros(next(value.shape for value in one.get_inputs() if value.name == "hidden"), np.float32)
     for frame in inputs:
-        hidden, made = one.run(["next_hidden", "vertices"], frame | {"hidden": hidden})
-        vertices.append(made[0])
-    return np.stack(vertices)
+        fed = {name: value for name, value in frame.items() if name in read}
+        hidden, result = one.run(["next_hidden", last], fed | {"hidden": hidden})
+        found.append(result[0])
+    return np.stack(found)
 
 
-def _by_coordinate(last: Layer, peer: Peer) -> Layer:
+def _by_coordinate(peer: Peer) -> Layer:
     """The layer that gives displacements [3 V], as one that gives the garment, all x first."""
 
     def ordered(rows):
         rows = rows.reshape(*rows.shape[:-1], -1, 3) * peer.free[:, None]
         return np.swapaxes(rows, -1, -2).reshape(*rows.shape[:-2], -1)
 
-    bias = ordered(last.bias) + peer.template.T.reshape(-1)
-    return Layer(ordered(last.kernel).astype(np.float32), bias.astype(np.float32))
+    bias = ordered(peer.shapes.bias) + peer.template.T.reshape(-1)
+    return Layer(ordered(peer.shapes.kernel).astype(np.float32), bias.astype(np.float32))
 
 
 def _ncs(g: Graph, params: Params, joints: int) -> str:
@@ -109,7 +130,7 @@ def _ncs(g: Graph, params: Params, joints: int) -> str:
     dynamic = g("Reshape", dynamic, np.array([1, joints * peers.LOCAL], np.int64))
     for layer in params["dynamic"]:
         dynamic = g("Relu", g.product(dynamic, layer["kernel"]))
-    memory = _unit(g, params["unit"], dynamic, "hidden", "next_hidden")
+    memory = _gru(g, params["unit"], dynamic, "hidden", "next_hidden")
     code = g("Add", static, memory)
     for layer in params["decoder"]:
         code = g("Relu", g.layer(code, Layer(**layer)))
@@ -119,13 +140,13 @@ def _ncs(g: Graph, params: Params, joints: int) -> str:
 def _snug(g: Graph, units: list[Params]) -> str:
     x, states, width = "inputs", [], len(units[0]["state"]["kernel"])
     for index, unit in enumerate(units):
-        x = _unit(g, unit, x, g.slice("hidden", 1, index * width, (index + 1) * width))
+        x = _gru(g, unit, x, g.slice("hidden", 1, index * width, (index + 1) * width))
         states.append(x)
     g("Concat", *states, axis=1, name="next_hidden")
     return x
 
 
-def _unit(g: Graph, params: Params, x: str, state: str, name: str | None = None) -> str:
+def _gru(g: Graph, params: Params, x: str, state: str, name: str | None = None) -> str:
     """A gated recurrent unit, as `peers` has it."""
     width = len(params["state"]["kernel"])
 
