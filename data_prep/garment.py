@@ -22,18 +22,24 @@ from scipy.spatial import ConvexHull
 
 from clothjax.storage import joint_names, load_body, save_garment
 from clothjax.types import Body, Garment
-from data_prep.diffusion import diffuse
+from data_prep.dressing import (
+    ARM,
+    FOREARM,
+    WINDING,
+    clear_vertices,
+    dress,
+    highest_opening,
+    limbs,
+    push_out,
+)
 from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
 from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
-from data_prep.user_mesh import FOREARM, Answers, Unit, Up, bring, draw
+from data_prep.user_mesh import FEWEST, MOST, Answers, Unit, Up, bring, draw
 from experiments.session import fail_clearly
 
-WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-CLEARANCE = 0.004  # m, kept between garment and body
 OFFSET = 0.012  # m, of the solid from the body
 CELL = 0.008  # m, of the distance field's grid
-ARM = ("LeftArm", "RightArm", *FOREARM)
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,7 @@ class Wearer(NamedTuple):
 
     vertices: np.ndarray  # [B, 3] m, float64
     faces: np.ndarray  # [F, 3] int64
-    arms: np.ndarray  # [B] share of the skinning weights on the arms
+    arms: np.ndarray  # [B] bool, whether of the arms
     joint: dict[str, np.ndarray]  # CMU's name: place [3]
     level: dict[str, float]  # name: height in m
 
@@ -117,58 +123,27 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
         triangles = triangles[:, ::-1]
 
     shape, faces, _ = resample(solid, triangles, vertices)
-    shape, faces = fit(shape, faces, wearer.vertices, wearer.faces)
+    shape, faces = _fit(shape, faces, wearer.vertices, wearer.faces)
     if len(boundary_loops(faces)) != kind.loops or components(faces, len(shape)).max() > 0:
         raise ValueError(
             f"template {template!r} came out with {len(boundary_loops(faces))} openings, not {kind.loops}, "
             "on this body: try another pose, or bring a mesh (--mesh)"
         )
-    bare = ARM if kind.waist else FOREARM
-    return _dress(shape, faces, body, names, bare, kind.samples, kind.waist, seed)
+    hidden = limbs(body, names, ARM if kind.waist else FOREARM)
+    pinned = highest_opening(shape, faces) if kind.waist else np.zeros(len(shape), bool)
+    return dress(shape, faces, body, hidden, pinned, kind.samples, seed)
 
 
-def fit(
+def _fit(
     vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The garment pushed out of the body: vertices by CLEARANCE, middles of edges and faces by half of it."""
-
-    def outward(points):
-        signed, _, foot = igl.signed_distance(points, body, triangles, sign_type=WINDING)[:3]
-        away = (points - foot) * np.sign(signed)[:, None]
-        return signed, away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-
+    """The garment smoothed and pushed out of the body."""
     for _ in range(4):
         faces, _ = flip(vertices, faces)
         border = boundary_mask(faces, len(vertices))[:, None]
         vertices = np.where(border, vertices, 0.6 * vertices + 0.4 * relax(vertices, faces, 1))
-        for _ in range(6):
-            signed, away = outward(vertices)
-            if signed.min() >= CLEARANCE:
-                break
-            vertices = vertices + away * np.where(signed < CLEARANCE, 1.02 * CLEARANCE - signed, 0)[:, None]
-    groups = (faces, faces[:, :2], faces[:, 1:], faces[:, [2, 0]])
-    for _ in range(20):
-        signed, away = outward(np.concatenate([vertices[g].mean(axis=1) for g in groups]))
-        if signed.min() >= CLEARANCE / 2:
-            break
-        move, count = np.zeros_like(vertices), np.zeros(len(vertices))
-        wrong = (signed < CLEARANCE / 2).reshape(len(groups), -1)
-        for group, bad, direction in zip(groups, wrong, away.reshape(len(groups), -1, 3)):
-            for column in group[bad].T:
-                np.add.at(move, column, direction[bad])
-                np.add.at(count, column, 1)
-        vertices = vertices + CLEARANCE / 2 * move / np.maximum(count, 1)[:, None]
-    return vertices, faces
-
-
-def _dress(shape, faces, body, names, bare, samples, pin, seed) -> Garment:
-    parts = [any(part in name for part in bare) for name in cmu_names(names)]
-    hidden = np.asarray(body.weights)[:, parts].sum(axis=1) > 0.3
-    weights, shapedirs = diffuse(shape, faces, body, samples=samples, hidden=hidden, seed=seed)
-    pinned = np.zeros(len(shape), bool)
-    if pin:
-        pinned[max(boundary_loops(faces), key=lambda loop: shape[loop, 1].mean())] = True
-    return Garment(shape.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned)
+        vertices = clear_vertices(vertices, body, triangles, 6)
+    return push_out(vertices, faces, body, triangles), faces
 
 
 def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
@@ -190,9 +165,7 @@ def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
         "knee": height["LeftLeg"],
         "ankle": height["LeftFoot"],
     }
-    parts = [any(part in name for part in ARM) for name in known]
-    arms = np.asarray(body.weights)[:, parts].sum(axis=1)
-    return Wearer(vertices, np.asarray(body.faces, np.int64), arms, joint, level)
+    return Wearer(vertices, np.asarray(body.faces, np.int64), limbs(body, names, ARM), joint, level)
 
 
 def _solid(kind: Template, wearer: Wearer) -> tuple[np.ndarray, np.ndarray]:
@@ -235,7 +208,7 @@ def _hang(kind: Template, wearer: Wearer, grid: Grid, hem: float) -> np.ndarray:
     """Implicit solid of what hangs: hulls of the body's slices and all above them, with a flare."""
     place, above, flare = kind.hull
     top = wearer.level[place] + above
-    trunk = wearer.vertices[wearer.arms < 0.3]
+    trunk = wearer.vertices[~wearer.arms]
     x, z = np.meshgrid(grid.axis(0), grid.axis(2), indexing="ij")
     field, outline = np.full(grid.shape, 1.0), np.zeros((0, 2))
     for i, y in reversed(list(enumerate(grid.axis(1)))):
@@ -290,21 +263,21 @@ class Arguments:
     """Makes a garment for a body, from a template or from a mesh that was modelled around it."""
 
     output: tyro.conf.Positional[Path]
-    template: Literal["tshirt", "tank", "pants", "skirt", "dress"] = "tshirt"
+    template: Literal["tshirt", "tank", "pants", "skirt", "dress"] | None = None
+    """This, or a mesh."""
     vertices: int | None = None
     """About so many; default: 1 000 of a template, a mesh as it is."""
     mesh: Path | None = None
-    """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose; instead of a template."""
+    """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose. What follows is of it."""
     units: Unit = "m"
-    """Of the mesh."""
     up: Up = "y"
-    """The axis of the mesh that points up."""
+    """The axis that points up."""
     pin: str = "none"
-    """What of the mesh follows the body: none, its `highest` opening, vertices painted `red`, or `object:NAME`."""
+    """What of it follows the body: none, its `highest` opening, vertices painted `red`, or `object:NAME`."""
     loose: bool | None = None
-    """Whether the mesh hangs, as skirts do; default: by its distance to the body."""
+    """Whether it hangs, as skirts do; default: by its distance to the body."""
     flip: bool = False
-    """The side of the mesh that faces the body is its outside."""
+    """The side that faces the body is its outside."""
     body: str = "body"
     """File of the body, or the name of the embedded one."""
     licence: str = "CC0-1.0"
@@ -312,14 +285,26 @@ class Arguments:
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for."""
+    """Writes the file the arguments ask for.
+
+    Raises:
+        ValueError: for arguments that do not go together, and what cannot be made.
+    """
+    if (args.mesh is None) == (args.template is None):
+        raise ValueError("give either --template or --mesh")
+    if args.vertices is not None and not FEWEST <= args.vertices <= MOST:
+        raise ValueError(f"--vertices {args.vertices}: {FEWEST} to {MOST} can be trained")
+    answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed)
+    of_mesh = Answers(vertices=args.vertices, seed=args.seed)
+    unread = [name for name in Answers._fields if getattr(answers, name) != getattr(of_mesh, name)]
+    if args.mesh is None and unread:
+        raise ValueError(f"--{unread[0]} says something of a mesh: give --mesh")
     body, names = load_body(args.body), joint_names(args.body)
     if args.mesh is None:
         count = args.vertices or 1000
         garment = build(args.template, count, body, names, args.seed)
         source = f"python -m data_prep.garment --template {args.template} --vertices {count}"
     else:
-        answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed)
         garment, said = bring(args.mesh, body, names, answers)
         print("\n".join(f"{args.mesh}: {line}" for line in said))
         source = args.mesh.name

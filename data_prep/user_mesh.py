@@ -13,23 +13,19 @@ from scipy.spatial import cKDTree
 
 from clothjax import animation
 from clothjax.types import Body, Garment
-from data_prep.diffusion import diffuse
+from data_prep.dressing import FOREARM, WINDING, dress, highest_opening, limbs, push_out
 from data_prep.mesh import boundary_loops, compact, components, edge_table
 from data_prep.remesh import resample
-from data_prep.retarget import cmu_names
 
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 Up = Literal["y", "z"]
 UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 TURNS = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}  # to +Y up
-WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
 WELD = 1e-4  # m, vertices closer than this are one
-CLEARANCE = 0.004  # m, kept between garment and body
 NEAR = 0.25  # m, a garment's mean distance to the body is less ...
 INSIDE = 10  # ... and counts so many times more where it is inside
 LOOSE = 0.03  # m, the median distance from which a garment counts as loose
 DEEP, MANY = 0.03, 0.15  # m inside the body, and the share of vertices so deep that the garment is another body's
-FOREARM = ("ForeArm", "Hand", "Finger", "Thumb")  # what many garments do not cover
 FEWEST, MOST = 100, 20_000  # vertices
 PINNED = (0.85, 0.1, 0.1)
 SAMPLES = 500  # of the diffusion onto loose garments
@@ -62,8 +58,6 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     Raises:
         ValueError: naming the file, the place in it, and what to do.
     """
-    if answers.vertices is not None and not FEWEST <= answers.vertices <= MOST:
-        raise ValueError(f"--vertices {answers.vertices}: {FEWEST} to {MOST} can be trained")
     mesh, said = read(path), []
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
     _check_place(path, mesh.vertices, surface, answers)
@@ -77,29 +71,24 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
         raise ValueError(
             f"{path}: {len(points)} vertices; {FEWEST} to {MOST} can be trained: give --vertices for another number"
         )
-    points = _pushed_out(path, points, surface, said)
+    points = _pushed_out(path, points, faces, surface, said)
     distance = np.abs(igl.signed_distance(points, *surface, sign_type=WINDING)[0])
     loose = bool(np.median(distance) > LOOSE) if answers.loose is None else answers.loose
     said.append(
         f"{'loose' if loose else 'tight'}: {1e3 * np.median(distance):.0f} mm from the body in the middle, so skin and "
         f"shape are those of the body {'around' if loose else 'nearest to'} each vertex"
     )
-    weights, shapedirs = diffuse(
-        points, faces, body, samples=SAMPLES if loose else 0, hidden=_bare(points, body, names), seed=answers.seed
-    )
-    pinned = marked
-    if answers.pin == "highest":
-        loops = boundary_loops(faces)
-        if not loops:
-            raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
-        pinned = np.zeros(len(points), bool)
-        pinned[max(loops, key=lambda loop: points[loop, 1].mean())] = True
+    openings = len(boundary_loops(faces))
+    if answers.pin == "highest" and not openings:
+        raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
+    pinned = highest_opening(points, faces) if answers.pin == "highest" else marked
     parts = 1 + int(components(faces, len(points)).max())
     said.append(
-        f"{len(points)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, {len(boundary_loops(faces))} "
-        f"openings, {int(pinned.sum())} vertices pinned"
+        f"{len(points)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, {openings} openings, "
+        f"{int(pinned.sum())} vertices pinned"
     )
-    return Garment(points.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned), said
+    hidden = _bare(points, body, names)
+    return dress(points, faces, body, hidden, pinned, SAMPLES if loose else 0, answers.seed), said
 
 
 def read(path: str | Path) -> Mesh:
@@ -117,7 +106,7 @@ def read(path: str | Path) -> Mesh:
         for node in scene.graph.nodes_geometry:
             place, name = scene.graph[node]
             if isinstance(scene.geometry[name], trimesh.Trimesh) and len(scene.geometry[name].faces):
-                parts.append((name, scene.geometry[name].copy().apply_transform(place)))
+                parts.append(({node, name}, scene.geometry[name].copy().apply_transform(place)))
     except Exception as error:  # whatever a reader of a damaged file of some format raises
         raise ValueError(f"{path}: not a mesh that can be read ({_brief(error)}); export it as .obj or .glb") from error
     if not parts:
@@ -130,10 +119,10 @@ def read(path: str | Path) -> Mesh:
         raise ValueError(f"{path}: vertex {wrong[0] + 1} of {len(vertices)} is not finite: {vertices[wrong[0]]}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path}: a face names vertex {faces.max() + 1} of {len(vertices)}")
-    objects = {
-        name: np.isin(np.arange(len(vertices)), np.asarray(part.faces) + start)
-        for (name, part), start in zip(parts, starts)
-    }
+    objects = {name: np.zeros(len(vertices), bool) for names, _ in parts for name in names}
+    for (names, part), start in zip(parts, starts):
+        for name in names:
+            objects[name][np.asarray(part.faces) + start] = True
     return Mesh(vertices, faces, np.concatenate([_red(part) for _, part in parts]), objects)
 
 
@@ -234,9 +223,10 @@ def _marked(path, mesh: Mesh, pin: str) -> np.ndarray:
 def _oriented(path, points, faces, surface, flip: bool, said: list[str]) -> np.ndarray:
     """Faces of each part turned one way, with the outside away from the body."""
     turned, part = igl.bfs_orient(faces)
-    halves = turned[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    if len(np.unique(halves, axis=0)) < len(halves):
-        raise ValueError(f"{path}: has only one side (a Moebius strip): cut it open")
+    halves, times = np.unique(turned[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=0, return_counts=True)
+    if times.max() > 1:
+        middle = np.round(points[halves[times.argmax()]].mean(axis=0), 3)
+        raise ValueError(f"{path}: has only one side (a Moebius strip): cut it open, as along the edge at {middle} m")
     foot = igl.signed_distance(points, *surface, sign_type=WINDING)[2]
     corners = points[turned]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -260,45 +250,44 @@ def _resampled(points, faces, marked, wanted: int, said: list[str]) -> tuple[np.
     """The surface with about so many vertices, each of them pinned if the nearest before was."""
     shape, triangles, length = resample(points, faces, wanted)
     said.append(f"remeshed: {len(points)} vertices to {len(shape)}, edges of {1e3 * length:.0f} mm")
-    nearest = np.linalg.norm(shape[:, None] - points[marked][None], axis=-1).min(axis=1) if marked.any() else np.inf
-    return shape, triangles, np.broadcast_to(nearest < 0.5 * length, len(shape)).copy()
+    if not marked.any():
+        return shape, triangles, np.zeros(len(shape), bool)
+    return shape, triangles, cKDTree(points[marked]).query(shape)[0] < 0.5 * length
 
 
 def _bare(points: np.ndarray, body: Body, names: tuple[str, ...]) -> np.ndarray:
     """Whether each vertex of the body [B] is of a forearm or a hand that the garment does not cover: a skirt must not
     follow the hands beside it."""
-    parts = [any(part in name for part in FOREARM) for name in cmu_names(names)]
-    hidden = np.asarray(body.weights)[:, parts].sum(axis=1) > 0.3
+    hidden = limbs(body, names, FOREARM)
     distance, nearest = cKDTree(body.vertices).query(points)
     covered = (hidden[nearest] & (distance < LOOSE)).mean() > 0.01
     return hidden & ~covered
 
 
-def _pushed_out(path, points: np.ndarray, surface, said: list[str]) -> np.ndarray:
-    """The vertices, none of them in the body or nearer to it than CLEARANCE."""
-    start = points
+def _pushed_out(path, points: np.ndarray, faces: np.ndarray, surface, said: list[str]) -> np.ndarray:
+    """The mesh out of the body."""
     signed = igl.signed_distance(points, *surface, sign_type=WINDING)[0]
-    deep = float((signed < -DEEP).mean())
+    deep, deepest = float((signed < -DEEP).mean()), np.round(points[signed.argmin()], 2)
     if deep > MANY:
         raise ValueError(
             f"{path}: {100 * deep:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, at most "
-            f"{-1e3 * signed.min():.0f}: it was made for another body or another pose; --body names the body"
+            f"{-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose; --body names "
+            "the body"
         )
-    for _ in range(10):
-        signed, _, foot = igl.signed_distance(points, *surface, sign_type=WINDING)[:3]
-        short = np.flatnonzero(signed < 0.999 * CLEARANCE)
-        if not len(short):
-            break
-        away = (points[short] - foot[short]) * np.sign(signed[short])[:, None]
-        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-        points = points.copy()
-        points[short] = foot[short] + 1.02 * CLEARANCE * away
-    moved = np.linalg.norm(points - start, axis=1)
+    cleared = push_out(points, faces, *surface)
+    signed = igl.signed_distance(cleared, *surface, sign_type=WINDING)[0]
+    if signed.min() < 0:
+        place = np.round(points[signed.argmin()], 2)
+        raise ValueError(
+            f"{path}: {int((signed < 0).sum())} vertices cannot be pushed out of the body, the first at {place} m: "
+            "move them out of it"
+        )
+    moved = np.linalg.norm(cleared - points, axis=1)
     if moved.any():
         said.append(
             f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most"
         )
-    return points
+    return cleared
 
 
 def draw(path: str | Path, garment: Garment, body: Body) -> None:

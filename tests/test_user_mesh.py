@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from clothjax import storage
+from data_prep import dressing, mesh, user_mesh
 from data_prep import garment as program
-from data_prep import mesh, user_mesh
 from data_prep.user_mesh import Answers, bring
 
 
@@ -108,6 +108,13 @@ def test_pins_by_colour_and_by_object(skirt, body, names, save, tmp_path):
         of_band = np.zeros(len(vertices), bool)
         of_band[faces[band]] = True
         assert made.pinned.sum() == of_band.sum()
+    placed = trimesh.Scene()
+    for name, part in (("waistband", band), ("below", rest)):
+        shape = trimesh.Trimesh(vertices, faces[part], process=False)
+        placed.add_geometry(shape, node_name=name, geom_name=f"mesh_of_{name}")
+    placed.export(tmp_path / "placed.glb")
+    made, _ = bring(tmp_path / "placed.glb", body, names, Answers(pin="object:waistband"))
+    assert made.pinned.sum() == of_band.sum()
     with pytest.raises(ValueError, match=r"no object 'hem'.*band, cloth|no object 'hem'.*cloth, band"):
         bring(tmp_path / "parts.glb", body, names, Answers(pin="object:hem"))
     with pytest.raises(ValueError, match="painted red"):
@@ -125,10 +132,22 @@ def test_it_is_pushed_out_of_the_body_and_remeshed(skirt, body, names, save):
         made.vertices.astype(float), np.asarray(body.vertices, float), np.asarray(body.faces, np.int64),
         sign_type=user_mesh.WINDING,
     )[0]  # fmt: skip
-    assert signed.min() > 0.9 * user_mesh.CLEARANCE
+    assert signed.min() > 0.9 * dressing.CLEARANCE
+    middles = made.vertices[made.faces].mean(axis=1).astype(float)
+    surface = np.asarray(body.vertices, float), np.asarray(body.faces, np.int64)
+    assert dressing.outward(middles, *surface)[0].min() > 0.4 * dressing.CLEARANCE
     assert any("pushed out" in line for line in said) and any("remeshed" in line for line in said)
-    with pytest.raises(ValueError, match="inside the body"):
+    with pytest.raises(ValueError, match=r"inside the body, at most \d+, at \["):
         bring(save(vertices * [0.4, 1, 0.4], faces), body, names, Answers())
+
+
+def test_a_second_skin_is_pushed_out(body):
+    surface = np.asarray(body.vertices, float), np.asarray(body.faces, np.int64)
+    trunk = np.flatnonzero(np.abs(surface[0][:, 1] - body.joints[0][1]) < 0.1)  # on the skin itself
+    moved = dressing.clear_vertices(surface[0][trunk], *surface, attempts=10)
+    signed = dressing.outward(moved, *surface)[0]  # but where legs or fingers leave no room
+    assert signed.min() > 0 and np.mean(signed > 0.99 * dressing.CLEARANCE) > 0.98
+    assert np.linalg.norm(moved - surface[0][trunk], axis=1).max() < 3 * dressing.CLEARANCE
 
 
 def test_what_is_no_cloth_is_refused_by_place(skirt, body, names, save, tmp_path):
@@ -138,7 +157,7 @@ def test_what_is_no_cloth_is_refused_by_place(skirt, body, names, save, tmp_path
     fin = np.concatenate([vertices, vertices[[a]] + [0, 0, 0.05]])
     with pytest.raises(ValueError, match="1 edges have more than two faces, the first at"):
         bring(save(fin, np.concatenate([faces, [[a, b, len(vertices)]]])), body, names, Answers())
-    with pytest.raises(ValueError, match=r"--vertices"):
+    with pytest.raises(ValueError, match=r"give --vertices"):
         bring(save(*trimesh.remesh.subdivide_loop(vertices, faces, 3)), body, names, Answers())
     path = save(*skirt)
     path.write_text(_with_nan(path.read_text()))
@@ -177,8 +196,22 @@ def test_a_moebius_strip_is_refused(body, names, save):
         if i == 59:
             c, d = d, c
         quads += [[a, b, c], [b, d, c]]
-    with pytest.raises(ValueError, match="one side"):
+    with pytest.raises(ValueError, match=r"one side.*along the edge at \["):
         bring(save(rows, np.array(quads)), body, names, Answers())
+
+
+def test_what_does_not_go_together_is_refused(tmp_path):
+    out, mesh = tmp_path / "mine.h5", tmp_path / "mine.obj"
+    for more, said in (
+        ({}, "either --template or --mesh"),
+        ({"template": "skirt", "mesh": mesh}, "either --template or --mesh"),
+        ({"template": "skirt", "pin": "red"}, "--pin says something of a mesh"),
+        ({"template": "skirt", "loose": False}, "--loose says something of a mesh"),
+        ({"template": "skirt", "vertices": 0}, "--vertices 0: 100 to 20000"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            program.main(program.Arguments(out, **more))
+    assert not out.exists()
 
 
 def test_the_program_writes_a_garment_and_its_picture(skirt, body, save, tmp_path, capsys):

@@ -1,0 +1,83 @@
+"""What the body gives every garment that is made for it: room, skinning and shape."""
+
+import igl
+import numpy as np
+
+from clothjax.types import Body, Garment
+from data_prep.diffusion import diffuse
+from data_prep.mesh import boundary_loops
+from data_prep.retarget import cmu_names
+
+WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+CLEARANCE = 0.004  # m, kept between garment and body
+FOREARM = ("ForeArm", "Hand", "Finger", "Thumb")
+ARM = ("LeftArm", "RightArm", *FOREARM)
+ON_SKIN = 1e-7  # m
+
+
+def push_out(vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The garment pushed out of the body: vertices by CLEARANCE, middles of edges and faces by half of it.
+
+    Between parts of a body that nearly touch there may be no such place; then it ends up between them.
+    """
+    vertices = clear_vertices(vertices, body, triangles, 10)
+    groups = (faces, faces[:, :2], faces[:, 1:], faces[:, [2, 0]])
+    for _ in range(20):
+        signed, away = outward(np.concatenate([vertices[g].mean(axis=1) for g in groups]), body, triangles)
+        if signed.min() >= CLEARANCE / 2:
+            break
+        move, count = np.zeros_like(vertices), np.zeros(len(vertices))
+        wrong = (signed < CLEARANCE / 2).reshape(len(groups), -1)
+        for group, bad, direction in zip(groups, wrong, away.reshape(len(groups), -1, 3)):
+            for column in group[bad].T:
+                np.add.at(move, column, direction[bad])
+                np.add.at(count, column, 1)
+        vertices = vertices + CLEARANCE / 2 * move / np.maximum(count, 1)[:, None]
+    return vertices
+
+
+def clear_vertices(points: np.ndarray, body: np.ndarray, triangles: np.ndarray, attempts: int) -> np.ndarray:
+    """The points [V, 3] moved away from the body until CLEARANCE is between them and it."""
+    for _ in range(attempts):
+        signed, away = outward(points, body, triangles)
+        if signed.min() >= 0.999 * CLEARANCE:
+            break
+        points = points + away * np.where(signed < CLEARANCE, 1.02 * CLEARANCE - signed, 0)[:, None]
+    return points
+
+
+def outward(points: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [V] of points to the body in m, negative inside, and the directions [V, 3] away from it."""
+    signed, face, foot = igl.signed_distance(points, body, triangles, sign_type=WINDING)[:3]
+    away = (points - foot) * np.sign(signed)[:, None]
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    on_skin = np.abs(signed) < ON_SKIN
+    away[on_skin] = igl.per_face_normals(body, triangles, np.array([0.0, 1.0, 0.0]))[face[on_skin]]
+    return signed, away
+
+
+def limbs(body: Body, names: tuple[str, ...], parts: tuple[str, ...], share: float = 0.3) -> np.ndarray:
+    """Whether each vertex of the body [B] follows, by more than a share, joints whose names contain one of `parts`."""
+    followed = [any(part in name for part in parts) for name in cmu_names(names)]
+    return np.asarray(body.weights)[:, followed].sum(axis=1) > share
+
+
+def highest_opening(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Whether each vertex [V] is on the highest boundary loop of a mesh that has one."""
+    highest = np.zeros(len(vertices), bool)
+    highest[max(boundary_loops(faces), key=lambda loop: vertices[loop, 1].mean())] = True
+    return highest
+
+
+def dress(
+    vertices: np.ndarray, faces: np.ndarray, body: Body, hidden: np.ndarray, pinned: np.ndarray, samples: int, seed: int
+) -> Garment:
+    """The garment with the body's skinning and shape diffused onto it.
+
+    Args:
+        hidden: [B] vertices of the body that the garment does not follow.
+        pinned: [V].
+        samples: of the diffusion, for loose garments; 0 for tight ones.
+    """
+    weights, shapedirs = diffuse(vertices, faces, body, samples=samples, hidden=hidden, seed=seed)
+    return Garment(vertices.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned)
