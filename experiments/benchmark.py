@@ -1,15 +1,19 @@
 """Measures how fast and how small the parts are, each beside something it is compared with, in one interleaved run.
 
-    python -m experiments.benchmark --part stage1 --json benchmark.json            # the paper's Phi, 4 000 vertices
-    python -m experiments.benchmark --part stage1 --quick                          # the embedded 1 000 vertices
-    python -m experiments.benchmark --part inference --json inference.json         # Psi on one thread, beside NCS
-    python -m experiments.benchmark tshirt runs/ncs --part pareto --json pareto.json    # error against time
+    python -m experiments.benchmark --json benchmark.json --plot benchmark.png     # all parts, one after the other
+    python -m experiments.benchmark --quick                                        # small networks and few rounds
+    python -m experiments.benchmark --compare old.json                             # ratios, and what is beyond noise
+    python -m experiments.benchmark --part stage1                                  # the paper's Phi, 4 000 vertices
+    python -m experiments.benchmark --part inference                               # Psi on one thread, beside NCS
+    python -m experiments.benchmark tshirt runs/ncs --part pareto                  # error against time
 
-Every time is the median of rounds in which all variants take turns. The processor is measured with and without
-recomputing its blocks in the backward pass (`model.remat`); beside each piece of a training step stand its flops and
-bytes (counted by the compiler, without recomputing) and the fractions of this machine's peaks, measured in the same
-run, that they make. `scenes` are of the quickstart's network on the same garment. Beside the JSON comes a plot of the
-cost against the vertices, or of error against time.
+Every time is the median of rounds in which all variants take turns; `noise` is the factor by which such a median
+differs from itself. The plots are named after the parts (`benchmark.stage1.png`).
+
+`stage1`: the processor is measured with and without recomputing its blocks in the backward pass (`model.remat`);
+beside each piece of a training step stand its flops and bytes (counted by the compiler, without recomputing) and the
+fractions of this machine's peaks, measured in the same run, that they make. `scenes` are of the quickstart's network
+on the same garment. The plot is of the cost against the vertices.
 
 `inference` times one frame on one thread, with weights in the cache: the paper's Psi (random weights, 4 000 vertices),
 NCS's network at its published sizes, and a trained garment of the library in its variants (in plain C too where there
@@ -21,77 +25,116 @@ the solver stopped early, and runs of peers (`configs/ncs.yaml`). It takes folde
 garments, by default all of these; what is compared on a garment must be trained for the same physics, wearers and
 motions. Phi and the solver are loops and take no turns: their times are of whole loops, or medians of their frames.
 Errors are those of `experiments.evaluate`, in closed loop on motions held out of training; `swing_error` is the rms
-error of the velocity of what skinning does not do, over the solver's. With `--compare OLD.json` it says whether two
-reports put the points in the same order (Kendall's tau).
+error of the velocity of what skinning does not do, over the solver's.
+
+With `--compare OLD.json` the times of both reports are set beside each other, and those flagged whose ratio is beyond
+the noise of both; of `pareto`, also whether both put the points in the same order (Kendall's tau).
 """
 
 import argparse
 import json
 import os
 import platform
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
 
 from clothjax import configuration, trained
 from clothjax.config import Config
-from experiments.benchmarks import inference, pareto, scaling, scenes, stage1
+from experiments.benchmarks import comparison, inference, pareto, scaling, scenes, stage1, timing
 from experiments.session import fail_clearly, setup
 
+PARTS = ("stage1", "inference", "pareto")
 SCENES = ["configs/quickstart.yaml"]
 PAPER = ["configs/paper_tshirt.yaml"]
 ROUNDS = 100  # of inference
 QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
-PARETO = {"rounds": 30, "frames": 60, "gaps": 6}
+PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
 QUICK_PARETO = {"rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",)}
+QUICK_GARMENTS = ("tshirt",)
 QUICK = ["configs/quickstart.yaml", "--model.body_nodes", "updated"]
 
 
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("runs", nargs="*", help="of --part pareto: folders of runs, names of shipped garments")
-    parser.add_argument("--part", choices=["stage1", "inference", "pareto"], default="stage1")
+    parser.add_argument("runs", nargs="*", help="of the part pareto: folders of runs, names of shipped garments")
+    parser.add_argument("--part", choices=PARTS, default=None, help="default: all")
     parser.add_argument("--json", type=Path, default=Path("benchmark.json"))
+    parser.add_argument("--plot", type=Path, default=None, help="default: beside the JSON")
     parser.add_argument("--quick", action="store_true", help="a small network and few rounds")
-    parser.add_argument("--compare", type=Path, default=None, help="of --part pareto: the JSON of an earlier run")
+    parser.add_argument("--compare", type=Path, default=None, help="the JSON of an earlier run")
     arguments = parser.parse_args(argv)
-    if arguments.part != "pareto" and (arguments.runs or arguments.compare):
-        raise ValueError("runs and --compare are for --part pareto")
-    if arguments.part == "pareto":
-        inference.one_thread()
-        before = earlier(arguments.compare) if arguments.compare else []
-        names = arguments.runs or trained.shipped()
-        runs = [trained.folder(name) if name in trained.shipped() else Path(name) for name in names]
-        measured = pareto.measure(runs, **(QUICK_PARETO if arguments.quick else PARETO))
-        if before:
-            measured["rank_tau"] = pareto.rank_tau(measured["points"], before)
-    elif arguments.part == "inference":
-        inference.one_thread()
-        measured = inference.measure(**QUICK_INFERENCE) if arguments.quick else inference.measure(ROUNDS)
+    if arguments.part not in (None, "pareto") and arguments.runs:
+        raise ValueError("runs are for the part pareto")
+    before = earlier(arguments.compare) if arguments.compare else None
+    path, plot = arguments.json, arguments.plot or arguments.json.with_suffix(".png")
+    if arguments.part is None:
+        report = each_part(arguments.runs, arguments.quick, plot)
     else:
-        measured = training_step(arguments.quick)
-    report = {"machine": machine(), arguments.part: measured}
-    path = arguments.json
+        report = measure(arguments.part, arguments.runs, arguments.quick)
+        drawn = plot.with_suffix(f".{arguments.part}{plot.suffix}")
+        drawn.parent.mkdir(parents=True, exist_ok=True)
+        {"stage1": scaling, "inference": inference, "pareto": pareto}[arguments.part].plot(
+            report[arguments.part], drawn
+        )
+        print(f"drawn in {drawn}")
+    if before:
+        report["compare"] = comparison.compare(report, before)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(report, indent=1) + "\n")
-    {"stage1": scaling, "inference": inference, "pareto": pareto}[arguments.part].plot(
-        measured, path.with_suffix(".png")
-    )
     print(json.dumps(report, indent=1))
-    print(f"written to {path} and {path.with_suffix('.png')}")
+    if before:
+        print("\n".join(comparison.lines(report["compare"])))
+    print(f"written to {path}")
 
 
-def earlier(path: Path) -> list[dict]:
-    """The points of an earlier report.
+def each_part(runs: list[str], quick: bool, plot: Path) -> dict:
+    """All parts, each in a process of its own: they differ in how many cores jax may use."""
+    report = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for part in PARTS:
+            path = Path(folder) / f"{part}.json"
+            command = [sys.executable, "-m", "experiments.benchmark", *(runs if part == "pareto" else [])]
+            command += ["--part", part, "--json", str(path), "--plot", str(plot), *(["--quick"] if quick else [])]
+            print(f"part {part}", flush=True)
+            if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
+                raise ValueError(f"the part {part} failed, as said above: run it alone with --part {part}")
+            report |= json.loads(path.read_text())
+    return report
+
+
+def measure(part: str, names: list[str], quick: bool) -> dict:
+    """The report of one part, and of the machine as that part uses it."""
+    if part == "stage1":
+        measured = training_step(quick)
+    else:
+        inference.one_thread()
+        if part == "inference":
+            measured = inference.measure(**QUICK_INFERENCE) if quick else inference.measure(ROUNDS)
+        else:
+            names = names or (QUICK_GARMENTS if quick else trained.shipped())
+            runs = [trained.folder(name) if name in trained.shipped() else Path(name) for name in names]
+            measured = pareto.measure(runs, **(QUICK_PARETO if quick else PARETO))
+    return {"machine": machine(), part: measured | {"peaks": timing.peaks(3), "noise": timing.noise()}}
+
+
+def earlier(path: Path) -> dict:
+    """An earlier report.
 
     Raises:
         ValueError: if it is none.
     """
     try:
-        return json.loads(path.read_text())["pareto"]["points"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a report of --part pareto ({error!r})") from error
+        report = json.loads(path.read_text())
+        if isinstance(report, dict) and "machine" in report and set(report) & set(PARTS):
+            return report
+        error = "no part of it is there"
+    except (OSError, ValueError) as raised:
+        error = raised
+    raise ValueError(f"{path}: not a report of experiments.benchmark ({error})")
 
 
 def training_step(quick: bool) -> dict:

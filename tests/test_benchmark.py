@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ from clothjax import configuration
 from clothjax.config import Config
 from clothjax.export import native
 from experiments import benchmark
-from experiments.benchmarks import inference, peers, scaling, scenes, stage1, timing
+from experiments.benchmarks import comparison, inference, peers, scaling, scenes, stage1, timing
 
 
 @pytest.mark.slow
@@ -29,7 +31,7 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stage1, "CONVOLUTION", (3, 4))
     monkeypatch.setattr(scaling, "SMALL", (300, 400))
     monkeypatch.setattr(scenes, "SCENES", {name: scenes.SCENES[name] for name in ("full", "no_bending")})
-    benchmark.main(["--quick", "--json", str(tmp_path / "b.json")])
+    benchmark.main(["--part", "stage1", "--quick", "--json", str(tmp_path / "b.json")])
     report = json.loads((tmp_path / "b.json").read_text())
     assert json.dumps(report, indent=1) in capsys.readouterr().out
     figures = report["stage1"]
@@ -47,7 +49,7 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     assert 0 < figures["contact_share"] < 1
     assert figures["compile_seconds_cached"] < figures["compile_seconds_cold"]
     assert figures["scenes"]["no_bending"]["flops_ratio"] < figures["scenes"]["full"]["flops_ratio"] == 1
-    assert (tmp_path / "b.png").exists()
+    assert (tmp_path / "b.stage1.png").exists() and figures["noise"] >= 1
 
 
 @pytest.mark.slow
@@ -55,7 +57,7 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark.inference, "one_thread", lambda: None)  # this process has other tests to run
     benchmark.main(["--part", "inference", "--quick", "--json", str(tmp_path / "b.json")])
     figures = json.loads((tmp_path / "b.json").read_text())["inference"]
-    assert (tmp_path / "b.png").exists()
+    assert (tmp_path / "b.inference.png").exists()
     variants = {each["name"]: each for each in figures["variants"]}
     assert len(variants) >= 12 and all(each["us"] > 0 for each in variants.values())
     assert variants["folded"]["error_mm"] < 1e-3 < variants["folded, int8"]["error_mm"] < 1.0
@@ -92,14 +94,57 @@ def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):
     assert small.stat().st_size < 3.3e6
 
 
-def test_calls_take_turns():
+def test_calls_take_turns(monkeypatch):
+    monkeypatch.setattr(timing, "_differences", [])
+    assert timing.noise() is None
     made = []
     calls = {name: (lambda name=name: made.append(name)) for name in "ab"}
-    seconds = inference.interleaved(calls, 4)
-    assert len(made) == 2 + 4 * 2 * inference.WARM and set(seconds) == {"a", "b"}
-    turns = made[2:][:: inference.WARM]
+    seconds = timing.interleaved(calls, 4, 3)
+    assert len(made) == 2 + 4 * 2 * 3 and set(seconds) == {"a", "b"} and timing.noise() >= 1.0
+    turns = made[2:][::3]
     assert all(set(turns[i : i + 2]) == {"a", "b"} for i in range(0, 8, 2))
     assert inference.floor_us(64 * 2**20, 3) > inference.floor_us(2**20, 3)
+
+
+def test_two_reports_are_compared_beyond_noise():
+    def report(step: float, us: float, noise: float = 1.1) -> dict:
+        points = [{"garment": "skirt", "run": "r", "name": name, "us": us * n, "energy_gap": 0.1 * n,
+                   "step_error_mm": n, "swing_error": 1 / n} for n, name in enumerate(("psi", "phi"), 1)]  # fmt: skip
+        return {
+            "machine": {"cores": 2},
+            "stage1": {"step_seconds": step, "vertices": 7, "seconds_by_vertices": {"510": 1.0}, "noise": noise},
+            "pareto": {"points": points, "noise": noise},
+        }
+
+    found = comparison.compare(report(2.0, 9.0), report(1.5, 10.0))
+    assert found["stage1"]["ratios"] == {"step_seconds": pytest.approx(4 / 3), "seconds_by_vertices/510": 1.0}
+    assert found["stage1"]["beyond_noise"] == ["step_seconds"] and found["pareto"]["beyond_noise"] == []
+    assert set(found["pareto"]["ratios"]) == {"points/skirt r psi/us", "points/skirt r phi/us"}
+    assert found["pareto"]["rank_tau"]["us"] == pytest.approx(1.0)
+    said = "\n".join(comparison.lines(found))
+    assert "SLOWER 1.33 x  step_seconds" in said and "machine" not in said
+    assert comparison.compare(report(2.0, 9.0, 1.3), report(1.5, 10.0))["stage1"]["beyond_noise"] == []
+    other = report(1.0, 1.0) | {"machine": {"cores": 64}}
+    assert "not the same machine" in comparison.lines(comparison.compare(report(1.0, 1.0), other))[0]
+
+
+def test_all_parts_are_run_and_put_together(tmp_path, monkeypatch):
+    ran = []
+
+    def run(command, **_):
+        part = command[command.index("--part") + 1]
+        ran.append(command)
+        Path(command[command.index("--json") + 1]).write_text(json.dumps({"machine": {}, part: {"us": 1.0}}))
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(benchmark.subprocess, "run", run)
+    benchmark.main(["skirt", "--quick", "--json", str(tmp_path / "b.json")])
+    report = json.loads((tmp_path / "b.json").read_text())
+    assert set(report) == {"machine", *benchmark.PARTS} and all("--quick" in command for command in ran)
+    assert ["skirt" in command for command in ran] == [False, False, True]
+    monkeypatch.setattr(benchmark.subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, 1))
+    with pytest.raises(ValueError, match="the part stage1 failed"):
+        benchmark.main(["--json", str(tmp_path / "b.json")])
 
 
 def test_the_configurations_measured_are_valid():
@@ -109,7 +154,7 @@ def test_the_configurations_measured_are_valid():
 
 def test_what_is_counted_is_what_the_program_does():
     one = timing.program(lambda a, b: a @ b, jnp.ones((64, 32)), jnp.ones((32, 16)))
-    np.testing.assert_array_equal(one.run(), 32.0)
+    np.testing.assert_array_equal(one(), 32.0)
     assert timing.cost(one)["flops"] == pytest.approx(2 * 64 * 32 * 16, rel=0.05)
     seconds = timing.interleaved({"small": one, "large": timing.program(lambda a: a @ a, jnp.ones((1500, 1500)))}, 3)
     assert 0 < seconds["small"] < seconds["large"]

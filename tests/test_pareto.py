@@ -65,9 +65,9 @@ def test_no_point_is_better_than_one_on_the_front():
 
 def test_what_cannot_be_compared(tmp_path):
     (tmp_path / "old.json").write_text(json.dumps({"inference": {}}))
-    with pytest.raises(ValueError, match=r"old\.json: not a report of --part pareto"):
+    with pytest.raises(ValueError, match=r"old\.json: not a report of experiments\.benchmark"):
         benchmark.earlier(tmp_path / "old.json")
-    with pytest.raises(ValueError, match="--part pareto"):
+    with pytest.raises(ValueError, match="runs are for the part pareto"):
         benchmark.main(["tshirt", "--part", "inference"])
 
 
@@ -128,7 +128,7 @@ def test_every_way_of_a_shipped_garment(tmp_path, capsys):
     assert points["skinning"]["us"] < points["psi"]["us"] < points["solver"]["us"]
     assert points["phi, 32 steps"]["step_error_mm"] < points["phi, 1 steps"]["step_error_mm"]
     assert points["psi"]["step_error_mm"] < points["skinning"]["step_error_mm"]
-    assert path.with_suffix(".png").stat().st_size > 1e4
+    assert path.with_suffix(".pareto.png").stat().st_size > 1e4
     again = tmp_path / "again.json"
     benchmark.main(["tshirt", "--part", "pareto", "--quick", "--json", str(again), "--compare", str(path)])
-    assert json.loads(again.read_text())["pareto"]["rank_tau"]["us"] > 0.5
+    assert json.loads(again.read_text())["compare"]["pareto"]["rank_tau"]["us"] > 0.5

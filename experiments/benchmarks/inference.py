@@ -3,7 +3,6 @@
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -19,7 +18,8 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.inference import Model
 from clothjax.latent_predictor import Normalizers, Scale
 from clothjax.types import Motion, Pose
-from experiments.benchmarks import peers
+from experiments.benchmarks import peers, timing
+from experiments.benchmarks.timing import Call
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -31,8 +31,6 @@ WARM = 3  # calls in a row of which the last is timed: what a game that draws no
 CROWDS = (1, 4, 16, 64, 256, 1024)
 STILL = 300  # frames that a character stands
 NEAR = 1.0  # mm, the error that is put up with
-
-Call = Callable[[], object]
 
 
 def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS) -> dict:
@@ -219,18 +217,8 @@ def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
 
 
 def interleaved(calls: dict[str, Call], rounds: int) -> dict[str, float]:
-    """Median microseconds of each call over rounds in which all take turns, in an order that changes."""
-    taken, order = {name: [] for name in calls}, np.random.default_rng(0)
-    for call in calls.values():
-        call()
-    for _ in range(rounds):
-        for name in order.permutation(list(calls)):
-            for _ in range(WARM):
-                began = time.perf_counter()
-                calls[name]()
-                seconds = time.perf_counter() - began
-            taken[name].append(seconds)
-    return {name: 1e6 * float(np.median(seconds)) for name, seconds in taken.items()}
+    """As `timing.interleaved`, in microseconds."""
+    return {name: 1e6 * seconds for name, seconds in timing.interleaved(calls, rounds, WARM).items()}
 
 
 def onnx_call(path: Path, model: Model) -> Call:

@@ -34,7 +34,8 @@ from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.types import Motion, Pose
 from experiments.benchmarks import peers
-from experiments.benchmarks.inference import Call, bound, c_call, interleaved, onnx_call
+from experiments.benchmarks.inference import bound, c_call, interleaved, onnx_call
+from experiments.benchmarks.timing import Call
 from experiments.evaluate import SETTLING, skinned_trajectory, windows
 from experiments.session import progress
 from experiments.train import load_phi

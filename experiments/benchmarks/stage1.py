@@ -81,7 +81,7 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
         return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
 
     single = difference()
-    exact, low = (programs[name].run()[1] for name in ("ours", "ours, products in bfloat16"))
+    exact, low = (programs[name]()[1] for name in ("ours", "ours, products in bfloat16"))
     with jax.enable_x64(True):
         arguments = jax.tree.map(solver.to_float64, arguments)
         double = difference()

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from functools import partial
 from typing import NamedTuple
 from unittest import mock
@@ -16,13 +16,17 @@ PASSES = 8
 STREAM = 64 * 2**20  # numbers, for the peak of the memory: no cache holds them
 
 
+Call = Callable[[], object]
+_differences: list[float] = []
+
+
 class Program(NamedTuple):
     """A compiled function with its arguments."""
 
     compiled: jax.stages.Compiled
     arguments: tuple
 
-    def run(self):
+    def __call__(self):
         return jax.block_until_ready(self.compiled(*self.arguments))
 
 
@@ -31,17 +35,33 @@ def program(function, *arguments) -> Program:
     return Program(jax.jit(function).lower(*arguments).compile(), arguments)
 
 
-def interleaved(programs: dict[str, Program], rounds: int) -> dict[str, float]:
-    """Median seconds of each program; all take turns, so that a slow minute is slow for all."""
-    taken = {name: [] for name in programs}
-    for each in programs.values():
-        each.run()
+def interleaved(calls: dict[Hashable, Call], rounds: int, in_a_row: int = 1) -> dict[Hashable, float]:
+    """Median seconds of each call over rounds in which all take turns, in an order that changes: a slow minute is slow
+    for all.
+
+    Args:
+        in_a_row: calls at each turn, of which the last is timed.
+    """
+    taken, order, names = {name: [] for name in calls}, np.random.default_rng(0), list(calls)
+    for call in calls.values():
+        call()
     for _ in range(rounds):
-        for name, each in programs.items():
-            began = time.perf_counter()
-            each.run()
-            taken[name].append(time.perf_counter() - began)
+        for index in order.permutation(len(names)):
+            for _ in range(in_a_row):
+                began = time.perf_counter()
+                calls[names[index]]()
+                seconds = time.perf_counter() - began
+            taken[names[index]].append(seconds)
+    for seconds in taken.values() if rounds > 1 else ():
+        one, other = np.median(seconds[::2]), np.median(seconds[1::2])
+        _differences.append(max(one, other) / min(one, other))
     return {name: float(np.median(seconds)) for name, seconds in taken.items()}
+
+
+def noise() -> float | None:
+    """By what factor the median time of a call differs from itself: the 95th percentile, over all that `interleaved`
+    has timed in this process, of the ratio between its odd rounds and its even ones; None before it has."""
+    return float(np.percentile(_differences, 95)) if _differences else None
 
 
 def temporary_bytes(one: Program) -> int:
