@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
 
 
-def comparison(path: str | Path, rows: dict[str, Sequence[np.ndarray]], columns: Sequence[str]) -> None:
+def comparison(path: str | Path | BinaryIO, rows: dict[str, Sequence[np.ndarray]], columns: Sequence[str]) -> None:
     """A labelled grid of pictures of one size as a PNG: one row a method, one column a moment."""
     image, draw, font = _pillow("Image", "ImageDraw", "ImageFont")
     height, width = next(iter(rows.values()))[0].shape[:2]
@@ -135,7 +135,7 @@ def comparison(path: str | Path, rows: dict[str, Sequence[np.ndarray]], columns:
         pen.text((left - 12, top + height * (r + 0.5)), label, fill="black", font=letters, anchor="rm")
         for c, picture in enumerate(pictures):
             sheet.paste(image.fromarray(picture), (left + width * c, top + height * r))
-    sheet.save(path)
+    sheet.save(path, format="png")
 
 
 def webp(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int = 82) -> None:

@@ -50,6 +50,7 @@ def save(directory: str | Path, step: int, state: Any, config: dict, description
 
     Raises:
         ValueError: if there is already a checkpoint of this step or a later one.
+        OSError: if it could not be written.
     """
     directory = Path(directory).resolve()
     existing = steps(directory)
@@ -67,8 +68,16 @@ def save(directory: str | Path, step: int, state: Any, config: dict, description
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
     )
-    with ocp.CheckpointManager(directory, options=options) as manager:
-        manager.save(step, args=ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about)))
+    try:
+        with ocp.CheckpointManager(directory, options=options) as manager:
+            parts = ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about))
+            manager.save(step, args=parts)
+    except Exception as error:  # whatever Orbax makes of a disk that is full, slow or gone
+        before = f"step {existing[-1]} is whole" if existing else "there is none before it"
+        raise OSError(
+            f"{directory}: the checkpoint of step {step} could not be written ({before}): make room, and run the same "
+            f"command again ({_first_line(error)})"
+        ) from error
 
 
 def steps(directory: str | Path) -> list[int]:

@@ -95,8 +95,13 @@ def _read(path: Path, children: tuple[Path, ...]) -> tuple[dict, Sources]:
     except OSError as error:
         child = f" (extended by {children[-1]})" if children else ""
         raise ValueError(f"{path}{child}: cannot be read: {error.strerror or error}") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise ValueError(
+            f"{path}, line {mark.line + 1}: is not valid YAML: {error.problem or error.context}"
+        ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not valid YAML: {error}") from error
+        raise ValueError(f"{path}: is not valid YAML: {' '.join(str(error).split())}") from error
     values = {} if values is None else values
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected `key: value` lines at the top, got {values!r}")

@@ -66,7 +66,13 @@ def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
     families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
     stages = [experiment.config.stage1] + [experiment.config.tuning] * (experiment.config.tuning.steps > 0)
     shortest = max(max(stage.rollout, stage.rollout_end) for stage in stages) + 1
-    reel = clips.concatenate(motions, families, bad, shortest)
+    try:
+        reel = clips.concatenate(motions, families, bad, shortest)
+    except ValueError as error:
+        left_out = sum(map(len, bad))
+        raise ValueError(
+            f"{', '.join(names)}: {error}; {left_out} frames were left out, a joint jumps there"
+        ) from error
     return reel, {name: len(wrong) for name, wrong in zip(names, bad)}
 
 

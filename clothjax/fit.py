@@ -189,13 +189,20 @@ def _check_finite(metrics: Metrics, step: int, skipped: int, allowed: int) -> in
     for i, flag in enumerate(metrics.get("nonfinite", np.zeros(bad_loss.shape))):
         now = step + i + 1
         if bad_loss[i] and not flag:
-            raise FloatingPointError(f"the loss of step {now} is {metrics['loss'][i]}")
+            raise FloatingPointError(f"the loss of step {now} is {metrics['loss'][i]}{_terms(metrics, i)}")
         skipped = skipped + 1 if flag else 0
         if skipped > allowed:
             raise FloatingPointError(
                 f"steps {now - skipped + 1} to {now} had non-finite gradients, more than {allowed} in a row"
+                f"{_terms(metrics, i)}"
             )
     return skipped
+
+
+def _terms(metrics: Metrics, index: int) -> str:
+    """Which metrics were not finite at a step of a call."""
+    wrong = [name for name in metrics if name != "loss" and not np.isfinite(metrics[name][index])]
+    return f" (not finite: {', '.join(wrong)})" if wrong else ""
 
 
 def _step(state: Any) -> int:

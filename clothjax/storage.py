@@ -119,9 +119,11 @@ def load_garment(path: str | Path, body: Body) -> Garment:
                 f"{file.filename}: half of the garment is more than {distance:.2f} m from the body: "
                 "it was made for another body or another origin; align the two"
             )
+        faces = _faces(file, ("F", 3), sizes, sizes["V"])
+        _check_sides(file, faces)
         return Garment(
             vertices=vertices,
-            faces=_faces(file, ("F", 3), sizes, sizes["V"]),
+            faces=faces,
             weights=_weights(file, "V", sizes),
             shapedirs=_floats(file, "shapedirs", ("V", 3, "S"), sizes),
             pinned=_dataset(file, "pin", ("V",), sizes).astype(bool),
@@ -296,6 +298,21 @@ def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) 
     if len(twice):
         raise ValueError(f"{file.filename}: face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it")
     return faces
+
+
+def _check_sides(file: h5py.File, faces: np.ndarray) -> None:
+    """Refuses what is no cloth with two sides."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    for rows, allowed in ((np.sort(ends, axis=1), 2), (ends, 1)):
+        _, first, times = np.unique(rows, axis=0, return_index=True, return_counts=True)
+        if times.max(initial=0) > allowed:
+            a, b = rows[first[times.argmax()]].tolist()
+            around = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1)).tolist()
+            if allowed == 2:
+                what = f"the edge of vertices {a} and {b} has {len(around)} faces, not two: separate the layers"
+            else:
+                what = f"faces {around[0]} and {around[1]} are wound opposite ways: turn one"
+            raise ValueError(f"{file.filename}: {what}; `python -m data_prep.garment --mesh` checks and orients a mesh")
 
 
 def _weights(file: h5py.File, letter: str, sizes: dict[str, int]) -> np.ndarray:

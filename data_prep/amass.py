@@ -14,9 +14,9 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.plausibility import bad_frames
 from clothjax.storage import UNREADABLE, canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
+from data_prep.repair import Bad, mend
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
 from data_prep.smpl import BODY
 from experiments.session import fail_clearly
@@ -106,6 +106,9 @@ class Arguments:
     """Length of a leg of who was recorded, hip to ankle, m."""
     freeze: bool = True
     """Keep wrists and toes still."""
+    bad: Bad = "keep"
+    """What becomes of frames in which no body could have moved so: `keep`, `repair` by interpolation, or `drop` all but
+    the longest stretch without any."""
     licence: str = "of the recording"
 
 
@@ -113,9 +116,9 @@ def main(args: Arguments) -> None:
     """Writes the file the arguments ask for, and says which frames are implausible."""
     motion, names = carry(read_amass(args.motion, args.up), args.body, fps=args.fps, leg=args.leg, freeze=args.freeze)
     name = args.motion.name.partition(".")[0]
+    motion, said = mend(motion, load_body(args.body), args.bad)
     save_motion(args.output, motion, names, name=name, source=args.motion.name, licence=args.licence)
-    bad = bad_frames(motion, load_body(args.body))
-    print(f"{args.output}: {len(motion.translation)} frames, implausible: {bad.tolist()}")
+    print(f"{args.output}: {len(motion.translation)} frames, {said}")
 
 
 if __name__ == "__main__":

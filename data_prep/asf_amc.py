@@ -14,8 +14,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.plausibility import bad_frames
 from clothjax.storage import joint_names, load_body, save_motion
+from data_prep.repair import Bad, mend
 from data_prep.retarget import Capture, numbers, read_lines, retarget
 from experiments.session import fail_clearly
 
@@ -194,6 +194,9 @@ class Arguments:
     """Degrees the clavicles are lowered, for the same reason."""
     freeze: bool = True
     """Keep hands, fingers and toes still."""
+    bad: Bad = "keep"
+    """What becomes of frames in which no body could have moved so: `keep`, `repair` by interpolation, or `drop` all but
+    the longest stretch without any."""
 
 
 def main(args: Arguments) -> None:
@@ -211,8 +214,9 @@ def main(args: Arguments) -> None:
     )
     licence = "of the recording; CMU's: free to use with credit, not to be resold (mocap.cs.cmu.edu)"
     name = args.motion.name.partition(".")[0]
+    motion, said = mend(motion, body, args.bad)
     save_motion(args.output, motion, names, name=name, source=str(args.motion.name), licence=licence)
-    print(f"{args.output}: {len(motion.translation)} frames, implausible: {bad_frames(motion, body).tolist()}")
+    print(f"{args.output}: {len(motion.translation)} frames, {said}")
 
 
 if __name__ == "__main__":

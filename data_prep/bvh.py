@@ -13,8 +13,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.plausibility import bad_frames
 from clothjax.storage import joint_names, load_body, save_motion
+from data_prep.repair import Bad, mend
 from data_prep.retarget import Capture, cmu_names, numbers, read_lines, retarget
 from experiments.session import fail_clearly
 
@@ -141,6 +141,9 @@ class Arguments:
     """Degrees the clavicles are lowered; 15 for CMU's recordings."""
     freeze: bool = True
     """Keep hands, fingers and toes still."""
+    bad: Bad = "keep"
+    """What becomes of frames in which no body could have moved so: `keep`, `repair` by interpolation, or `drop` all but
+    the longest stretch without any."""
     licence: str = "of the recording"
 
 
@@ -159,8 +162,9 @@ def main(args: Arguments) -> None:
         freeze=args.freeze,
     )
     name = args.motion.name.partition(".")[0]
+    motion, said = mend(motion, body, args.bad)
     save_motion(args.output, motion, names, name=name, source=args.motion.name, licence=args.licence)
-    print(f"{args.output}: {len(motion.translation)} frames, implausible: {bad_frames(motion, body).tolist()}")
+    print(f"{args.output}: {len(motion.translation)} frames, {said}")
 
 
 if __name__ == "__main__":

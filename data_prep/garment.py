@@ -61,6 +61,7 @@ class Template:
 
 TEMPLATES = {
     "tshirt": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=0.55, neck=0.015),
+    "longsleeve": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=1.75, neck=0.015),
     "tank": Template(("crotch", 0.02), 4, scoop=0.10),
     "pants": Template(("ankle", 0.06), 3, closing=0.02, blur=1.0, waist=True),
     "skirt": Template(
@@ -263,7 +264,7 @@ class Arguments:
     """Makes a garment for a body, from a template or from a mesh that was modelled around it."""
 
     output: tyro.conf.Positional[Path]
-    template: Literal["tshirt", "tank", "pants", "skirt", "dress"] | None = None
+    template: Literal["tshirt", "longsleeve", "tank", "pants", "skirt", "dress"] | None = None
     """This, or a mesh."""
     vertices: int | None = None
     """About so many; default: 1 000 of a template, a mesh as it is."""

@@ -145,7 +145,8 @@ def _check_place(path, vertices: np.ndarray, surface, answers: Answers) -> None:
         larger or smaller."""
         points = UNITS[units] * vertices @ TURNS[up].T
         height = np.ptp(surface[0][:, 1])
-        if not 0.05 * height < np.ptp(points, axis=0).max() < 1.5 * height:
+        smallest = 0.05 if (units, up) == (answers.units, answers.up) else 0.15
+        if not smallest * height < np.ptp(points, axis=0).max() < 1.5 * height:
             return np.inf, np.inf
         few = points[:: max(1, len(points) // 500)]
         signed = igl.signed_distance(few, *surface, sign_type=WINDING)[0]

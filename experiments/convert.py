@@ -57,6 +57,8 @@ def main(argv: list[str]) -> None:
     betas = None
     if arguments.betas is not None:
         count = storage.load_body(trained.psi(run)[0].body).shapedirs.shape[-1]
+        if len(arguments.betas) > count:
+            raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
     material = None if arguments.material is None else Material(*arguments.material)
     model = inference.load(run, betas=betas, material=material)

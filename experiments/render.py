@@ -92,19 +92,26 @@ def write_comparison(run: Path, whole: Experiment, motion: str, out: Path) -> No
         raise ValueError(f"{path}: no such file; run `python -m experiments.evaluate {run} --motion {motion}` first")
     with np.load(path) as tracks:
         tracks = {name: tracks[name] for name in ROWS}
-    clip = experiment.motion(whole, motion)
-    body, root = body_trajectory(whole, clip)
-    moments = np.linspace(0, min(map(len, tracks.values())) - 1, 6)[1:].astype(int)
+    rows, columns = at_moments(whole, motion, {label: tracks[name] for name, label in ROWS.items()})
+    animation.comparison(out, rows, columns)
+
+
+def at_moments(
+    whole: Experiment, motion: str, tracks: dict[str, np.ndarray], count: int = 5
+) -> tuple[dict[str, list[np.ndarray]], list[str]]:
+    """Rows of pictures of trajectories [T, V, 3] m over a clip, all at the same moments, and what each column shows."""
+    body, root = body_trajectory(whole, experiment.motion(whole, motion))
+    moments = np.linspace(0, min(map(len, tracks.values())) - 1, count + 1)[1:].astype(int)
     floor = float((body + root[:, None])[moments][..., 1].min())
     camera = animation.camera_for(body[moments])
     rows = {
         label: [
-            animation.render(dressed(whole, body[t], tracks[name][t]), camera, SIZE, floor=floor - float(root[t, 1]))
+            animation.render(dressed(whole, body[t], track[t]), camera, SIZE, floor=floor - float(root[t, 1]))
             for t in moments
         ]
-        for name, label in ROWS.items()
+        for label, track in tracks.items()
     }
-    animation.comparison(out, rows, [f"frame {t + 1}" for t in moments])
+    return rows, [f"frame {t + 1}" for t in moments]
 
 
 def body_trajectory(whole: Experiment, clip: Motion, betas: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

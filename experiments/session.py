@@ -1,6 +1,7 @@
 """What every program here does around its work: compilation cache, progress, one clear line for a user's mistake."""
 
 import contextlib
+import errno
 import os
 import sys
 import time
@@ -11,6 +12,8 @@ import jax
 from tqdm import tqdm
 
 from clothjax import devices
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def setup() -> None:
@@ -24,10 +27,14 @@ def fail_clearly() -> Iterator[None]:
     """Ends the program with one line and exit code 1 on a mistake of the user's or a training that diverged."""
     try:
         yield
-    except (ValueError, FileNotFoundError, FloatingPointError, ImportError) as error:
+    except (ValueError, OSError, FloatingPointError, ImportError) as error:
         if os.environ.get("CLOTHJAX_TRACEBACK"):
             raise
-        print(f"error: {error}", file=sys.stderr)
+        full = isinstance(error, OSError) and error.errno in FULL
+        hint = (
+            "; make room, and run the same command again: a training goes on from its last checkpoint" if full else ""
+        )
+        print(f"error: {error}{hint}", file=sys.stderr)
         raise SystemExit(1) from None
 
 

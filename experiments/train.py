@@ -62,7 +62,11 @@ def main(argv: list[str]) -> None:
         wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
         batches = [config.stage1.batch, config.stage2.batch]
         batches += [stage.batch for stage in (config.tuning, config.refinement) if stage.steps > 0]
-        train(config, directory, devices.choose(wanted, *batches))
+        try:
+            train(config, directory, devices.choose(wanted, *batches))
+        except FloatingPointError as error:
+            hint = f"`python -m experiments.replay {directory}` shows what the bad step was made of"
+            raise FloatingPointError(f"{error}; {hint}") from error
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:

@@ -2,14 +2,17 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
+import faults
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +52,8 @@ def one(bad_steps, state, _):
         updates, optimizer = SGD.update(gradient, state.optimizer, state.params)
     new = (optax.apply_updates(state.params, updates), optimizer)
     params, optimizer = jax.tree.map(partial(jnp.where, good), new, (state.params, state.optimizer))
-    return State(state.step + 1, state.key, params, optimizer), {"loss": value, "nonfinite": ~good}
+    term = jnp.where(good, value, jnp.inf)
+    return State(state.step + 1, state.key, params, optimizer), {"loss": value, "stretching": term, "nonfinite": ~good}
 
 
 @lru_cache  # compiled once
@@ -194,6 +198,34 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path, straight):
     assert [row["step"] for row in rows(tmp_path)] == list(range(4, 41, 4))
 
 
+@pytest.mark.slow
+def test_a_checkpoint_cut_anywhere_is_noticed_and_the_one_before_it_used(tmp_path, straight):
+    train(tmp_path / "whole", steps=20, checkpoint_seconds=0.0)
+    checkpoints = tmp_path / "whole" / "checkpoints"
+    newest = checkpoints / str(checkpoint.steps(checkpoints)[-1])
+    files = [path.relative_to(newest) for path in sorted(newest.rglob("*")) if path.is_file()]
+    cases = lost = silent = 0
+    for path in files:
+        size = (newest / path).stat().st_size
+        for at in sorted({round(share * size) for share in np.linspace(0, 0.99, 10)}):
+            directory = tmp_path / "cut"
+            shutil.copytree(tmp_path / "whole", directory)
+            os.truncate(directory / "checkpoints" / newest.name / path, at)
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                state = train(directory, steps=40).state
+            try:
+                assert_same(state, straight[0])
+            except AssertionError:
+                lost += 1
+            aside = (directory / "checkpoints" / f"{newest.name}.damaged").exists()
+            silent += aside and not any(str(newest.name) in str(warning.message) for warning in said)
+            cases += 1
+            shutil.rmtree(directory)
+    faults.record("damaged", cases=cases, lost=lost, silent=silent)
+    assert cases > 50 and lost == silent == 0
+
+
 def test_another_configuration_is_refused(tmp_path):
     train(tmp_path, steps=4)
     changed = {"train": {"rate": 0.5, "steps": 40}, "hidden": (3, 5), "more": 1}
@@ -219,7 +251,8 @@ def test_a_few_skipped_updates_are_counted(tmp_path):
 
 def test_too_many_skipped_updates_in_a_row_stop_the_run(tmp_path):
     update = make_update(bad_steps=tuple(range(14, 40)))
-    with pytest.raises(FloatingPointError, match=r"steps 15 to 19 had non-finite gradients, more than 4 in a row"):
+    said = r"steps 15 to 19 had non-finite gradients, more than 4 in a row \(not finite: stretching\)"
+    with pytest.raises(FloatingPointError, match=said):
         train(tmp_path, update, max_nonfinite=4, checkpoint_seconds=0.0)
     assert checkpoint.steps(tmp_path / "checkpoints")[-1] == 16
 

@@ -9,6 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
+import faults
 import fuzzed
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,6 @@ from toy import small, untrained_psi
 from clothjax import checkpoint, configuration, features, storage, trained
 
 FEW, MANY = 15, 5000
-REPORT = Path("runs/faults/fuzz.json")
 NAMES = ["root", "mid", "top"]
 
 
@@ -122,10 +122,9 @@ def test_some_damaged_files(reader, seeds):
 def test_many_damaged_files(reader, seeds):
     found = outcomes(reader, seeds[reader], MANY)
     kinds = {kind: sum(o.startswith(kind) for o in found) for kind in ("valid", "refused", "unclear", "bad")}
-    REPORT.parent.mkdir(parents=True, exist_ok=True)
-    report = json.loads(REPORT.read_text()) if REPORT.is_file() else {}
-    REPORT.write_text(json.dumps(report | {reader: kinds}, indent=1) + "\n")
-    print(reader, kinds)
+    readers = faults.recorded("fuzz").get("readers", {}) | {reader: kinds}
+    wrong = sum(kinds["bad"] + kinds["unclear"] for kinds in readers.values())
+    faults.record("fuzz", readers=readers, files=sum(sum(k.values()) for k in readers.values()), bad_outcomes=wrong)
     _judge(reader, found, MANY)
 
 

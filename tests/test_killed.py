@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import faults
 import killed
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from clothjax import checkpoint, configuration
 from clothjax.config import TuningConfig
 
 TIMES = 50
-REPORT = Path("runs/faults/kill.json")
 STAGES = ("stage1", "stage2", "tuning")
 
 
@@ -71,8 +71,5 @@ def test_killed_at_random_moments(tmp_path):
             assert_same(expected, params(directory))
         except AssertionError:
             unequal += 1
-    REPORT.parent.mkdir(parents=True, exist_ok=True)
-    report = {"times": kills, "finished": finished, "unequal": unequal}
-    REPORT.write_text(json.dumps(report, indent=1) + "\n")
-    print(report, f"{seconds:.0f} s a run")
+    faults.record("kill", times=kills, finished=finished, unequal=unequal)
     assert unequal == 0

@@ -5,7 +5,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -369,7 +369,7 @@ def _moving(whole: Experiment) -> tuple[np.ndarray, np.ndarray]:
     return weights[:, moving].T, moving
 
 
-def plot(report: dict, path: Path) -> None:
+def plot(report: dict, path: Path | BinaryIO) -> None:
     """Each error against time, a row for each garment, with the fronts."""
     points = report["points"]
     garments = list(dict.fromkeys(point["garment"] for point in points))
