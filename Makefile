@@ -7,15 +7,20 @@ SHELL := bash
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
+API := runs/api
+MODULES := $(patsubst clothjax/%.py,clothjax.%,$(filter-out clothjax/__%,$(wildcard clothjax/*.py)))
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
-.PHONY: quickstart demo test test-slow lint
+.PHONY: quickstart demo docs test test-slow lint
 
 quickstart: $(INSTALLED)  ## train both stages on the embedded body, evaluate, render, export
 	@$(PYTHON) -m experiments.quickstart
 
 demo: $(INSTALLED)  ## a character that you steer, live in the browser
 	@$(PYTHON) -m experiments.demo
+
+docs: $(INSTALLED)  ## the reference of the library, made from its docstrings: runs/api/index.html
+	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax clothjax.export $(MODULES)
 
 test: $(INSTALLED)  ## the tests of every day
 	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile
@@ -43,6 +48,6 @@ $(INSTALLED): pyproject.toml uv.lock
 	        echo "no Python 3.11 or newer with its venv module (tried: $(CANDIDATES))" >&2
 	        exit 1
 	    fi
-	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,demo,export,render,sweep]'
+	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,demo,docs,export,render,sweep]'
 	fi
 	touch $@

@@ -13,6 +13,7 @@ COMMANDS = {
     "render": "experiments.render, experiments.quickstart: pictures, glTF, USD, video",
     "sweep": "experiments.sweep: several trainings at once",
     "demo": "experiments.demo: the live page",
+    "docs": "make docs: the reference of the library",
     "compare": "experiments.compare_solvers: beside NVIDIA Newton",
     "dev": "make test",
 }

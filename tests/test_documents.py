@@ -112,6 +112,15 @@ def test_commands(workplace):
             shutil.copy(storage.asset("walk_0"), workplace / "take.h5")
 
 
+@pytest.mark.slow
+def test_the_reference_is_made_from_the_docstrings(tmp_path):
+    run(["make", "docs", f"API={tmp_path}", f"VENV={sys.prefix}"], ROOT)
+    page = (tmp_path / "clothjax" / "inference.html").read_text()
+    assert "the garment's vertices [V, 3] m in the world" in page
+    made = {path.stem for path in (tmp_path / "clothjax").glob("*.html")}
+    assert {path.stem for path in (ROOT / "clothjax").glob("[a-z]*.py")} <= made
+
+
 def run(command: list[str], folder: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(folder)}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
