@@ -12,6 +12,7 @@ for which all others then wait.
 import argparse
 import sys
 import time
+import webbrowser
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -42,17 +43,15 @@ class Viewer:
     The panel's callbacks run in other threads: they only leave word, and `run` acts on it.
 
     Args:
+        server: viser's.
         garments: folders of runs or packed models, by name.
     """
 
-    def __init__(self, show: Show, garments: dict[str, Path], garment: str, host: str, port: int):
-        import viser
-
-        self.show, self.garments = show, garments
+    def __init__(self, server, show: Show, garments: dict[str, Path], garment: str):
+        self.server, self.show, self.garments = server, show, garments
         self.meshes: dict = {}
         self._shown: tuple | None = None
         self._dress_anew = self._draw_anew = self._one_more = False
-        self.server = server = viser.ViserServer(host, port, label="clothjax", verbose=False)
         server.scene.set_up_direction("+y")
         self.floor = server.scene.add_grid(
             "/floor", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=GRID, infinite_grid=True
@@ -197,10 +196,10 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--motions", type=Path, nargs="+", help="clips to go about by; default: the embedded ones")
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=8080)
+    parser.add_argument("--no-browser", action="store_true", help="do not open the page")
     parser.add_argument("--frames", type=int, help="so many, then stop")
     arguments = parser.parse_args(argv)
     viewer = start(arguments)
-    print(f"open http://{arguments.host}:{viewer.server.get_port()} in a browser; stop with Ctrl-C", flush=True)
     try:
         viewer.run(arguments.frames)
     except KeyboardInterrupt:
@@ -210,15 +209,20 @@ def main(argv: list[str]) -> None:
 
 
 def start(arguments: argparse.Namespace) -> Viewer:
-    """A viewer that waits to be run.
+    """A viewer that waits to be run; the browser fetches its page meanwhile.
 
     Raises:
         ImportError: if viser is not installed.
     """
     try:
-        import viser  # noqa: F401
+        import viser
     except ImportError as error:
         raise ImportError("the demo needs viser: pip install clothjax[demo]") from error
+    server = viser.ViserServer(arguments.host, arguments.port, label="clothjax", verbose=False)
+    address = f"http://{arguments.host}:{server.get_port()}"
+    print(f"open {address} in a browser; stop with Ctrl-C", flush=True)
+    if not arguments.no_browser:
+        webbrowser.open(address)
     garments, garment = {name: trained.folder(name) for name in trained.shipped()}, arguments.garment
     if arguments.run is not None:
         garments, garment = {arguments.run.name: arguments.run}, arguments.run.name
@@ -227,7 +231,7 @@ def start(arguments: argparse.Namespace) -> Viewer:
     motions = clips(arguments.motions, names)
     found = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
     wander = tuple(name for name in found.families if name in WANDER) or found.families
-    return Viewer(Show(found, wander, garments[garment]), garments, garment, arguments.host, arguments.port)
+    return Viewer(server, Show(found, wander, garments[garment]), garments, garment)
 
 
 def clips(paths: list[Path] | None, names: tuple[str, ...]) -> dict[str, Motion]:

@@ -170,7 +170,7 @@ def test_clips_of_yours_are_called_as_their_files(tmp_path):
 @pytest.fixture
 def viewer():
     pytest.importorskip("viser")
-    given = argparse.Namespace(garment="skirt", run=None, motions=None, host="127.0.0.1", port=8123)
+    given = argparse.Namespace(garment="skirt", run=None, motions=None, host="127.0.0.1", port=8123, no_browser=True)
     viewer = demo.start(given)
     yield viewer
     viewer.server.stop()
@@ -226,7 +226,7 @@ def test_a_browser_steers_and_sees_the_garment_move(tmp_path):
     """From the command to a picture, keys and a slider; the rate of garments with the viewer running."""
     playwright = pytest.importorskip("playwright.sync_api")
     began = time.perf_counter()
-    command = [sys.executable, "-m", "experiments.demo", "--port", "8124"]
+    command = [sys.executable, "-m", "experiments.demo", "--port", "8124", "--no-browser"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process, playwright.sync_playwright() as tool:
         try:
             watchdog = threading.Timer(120, process.kill)

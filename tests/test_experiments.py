@@ -70,6 +70,7 @@ def test_a_finished_run_is_not_trained_again(finished):
     assert sorted(path.name for path in (finished / "stage1" / "checkpoints").iterdir()) == before
 
 
+@pytest.mark.slow
 def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch):
     evaluate.main([str(finished), "--motion", "twist_3", "--json", str(finished / "twist.json")])
     assert "twist_3" in json.loads((finished / "twist.json").read_text())["motions"]
@@ -165,7 +166,7 @@ def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solver
 
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate.trained, "phi", lambda _: (Config(), {}))
+    monkeypatch.setattr(evaluate.trained, "network", lambda _: (Config(), {}))
     figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
 
     def measured(folder, motions):

@@ -73,6 +73,7 @@ def test_the_sixteen_materials_are_the_corners_of_the_ranges():
     assert min(value[1] for value in found) == float(low[1])
 
 
+@pytest.mark.slow
 def test_the_solver_recovers_or_says_that_it_did_not():
     outcomes = cases.stress(small(), 2, True, lambda done: None)
     assert len(outcomes) == 7

@@ -130,6 +130,7 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     assert set(terms) == expected  # no self-contact: it is off
 
 
+@pytest.mark.slow
 def test_gradients_go_through_as_many_frames_as_configured(toy):
     whole, reel = toy
     config, scene = whole.config, whole.scene
