@@ -121,8 +121,33 @@ def build(
     if material is None:
         material = Material(cloth.density, cloth.mu, cloth.lam, cloth.bending)
     material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
+    network, wearer = _arrays(garment, body, garment_params, predictor, normalizers, betas, material, config)
+    return Model(
+        network=network,
+        wearer=wearer,
+        faces=jnp.asarray(garment.faces),
+        names=tuple(names),
+        parents=tuple(int(p) for p in body.parents),
+        kept=tuple(int(k) for k in latent_predictor.kept_joints(names, config.stage2)),
+        moving=tuple(range(len(names))),
+        config=config,
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def _arrays(
+    garment: Garment,
+    body: Body,
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    betas: Array,
+    material: Material,
+    config: Config,
+) -> tuple[Network, Wearer]:
+    """The arrays of a model, all in one program: it starts in a fraction of the time that one by one they take."""
     constants, known = latent_predictor.bounded_constants(
-        latent_predictor.constant_inputs(betas, material, cloth), config
+        latent_predictor.constant_inputs(betas, material, config.material), config
     )
     latent, pose = normalizers
     size = len(latent.mean)
@@ -155,16 +180,7 @@ def build(
         joints=skinning.shaped_joints(body, betas),
         known=known,
     )
-    return Model(
-        network=network,
-        wearer=wearer,
-        faces=jnp.asarray(garment.faces),
-        names=tuple(names),
-        parents=tuple(int(p) for p in body.parents),
-        kept=tuple(int(k) for k in latent_predictor.kept_joints(names, config.stage2)),
-        moving=tuple(range(len(names))),
-        config=config,
-    )
+    return network, wearer
 
 
 def _layers(mlp: dict) -> list[Layer]:
@@ -209,6 +225,7 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
     )
 
 
+@jax.jit
 def initial_state(model: Model, pose: Pose) -> State:
     """The state before the first frame: the code is zero and the character has been standing in `pose`.
 

@@ -115,7 +115,7 @@ def _said(
             where = f"frame {int(was.frame) - begin[clip]} of {list(clips)[clip]}"
         farthest = float(np.abs(was.cloth.position).max())
         lines.append(
-            f"  simulation {index}: {where}; betas {np.round(one.betas, 2).tolist()}; {material}; its farthest vertex "
+            f"  simulation {index}: {where}; betas {np.round(one.betas.astype(float), 2).tolist()}; {material}; its farthest vertex "
             f"{farthest:.2f} m from the root"
         )
     return "\n".join(lines)
