@@ -114,9 +114,9 @@ def _said(
             clip = int(np.searchsorted(begin, was.frame, side="right")) - 1
             where = f"frame {int(was.frame) - begin[clip]} of {list(clips)[clip]}"
         farthest = float(np.abs(was.cloth.position).max())
+        betas = np.round(one.betas.astype(float), 2).tolist()
         lines.append(
-            f"  simulation {index}: {where}; betas {np.round(one.betas.astype(float), 2).tolist()}; {material}; its farthest vertex "
-            f"{farthest:.2f} m from the root"
+            f"  simulation {index}: {where}; betas {betas}; {material}; its farthest vertex {farthest:.2f} m from the root"
         )
     return "\n".join(lines)
 

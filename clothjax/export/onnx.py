@@ -107,10 +107,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     following = {"next_latent": latent_shape, "next_history": history_shape, "ok": (batch,)}
     if output == "none":
         return given, following, g
-    vertices = wearer.template.shape[1]
-    template = np.asarray(wearer.template).reshape(-1)
-    limits = np.abs(folding.ordinary_weights(model)).max(axis=0) if int8 else None
-    garment = g.even(shape_weights(g, latent, model), limits, Layer(network.shapes, template))
+    vertices, garment = wearer.template.shape[1], canonical(g, latent, model)
     if output == "world":
         moving = g("Gather", chain, np.array(model.moving, np.int64), axis=1)
         transforms = g.slice(g.reshape(moving, len(model.moving), 16), 2, 0, 12)
@@ -215,6 +212,13 @@ def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[s
     kept = g("Mul", "latent", np.float32(1.0 - model.config.stage2.latent_decay))
     bounds = network.code_bounds
     return g.within(g("Add", kept, x), bounds.low, bounds.high, name="next_latent")
+
+
+def canonical(g: Graph, latent: str, model: Model) -> str:
+    """The garment [N, 3 V] m in the canonical pose, one coordinate after the other."""
+    limits = np.abs(folding.ordinary_weights(model)).max(axis=0) if g.int8 else None
+    template = np.asarray(model.wearer.template).reshape(-1)
+    return g.even(shape_weights(g, latent, model), limits, Layer(model.network.shapes, template))
 
 
 def shape_weights(g: Graph, latent: str, model: Model) -> str:

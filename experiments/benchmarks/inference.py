@@ -85,7 +85,7 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
             path = onnx.to_onnx(model, folder / "psi.onnx", int8=int8)
             kinds[kind] = errors[kind]
             calls[f"psi: {kind}"], size[f"psi: {kind}"] = onnx_call(path, model), path.stat().st_size
-            path = _network(model, folder / "network.onnx", int8)
+            path = given_features(model, folder / "network.onnx", int8=int8, whole=False)
             calls[f"psi network: {kind}"], size[f"psi network: {kind}"] = session_call(path), path.stat().st_size
     peer = peers.published(vertices)
     for int8 in (False, True):
@@ -284,14 +284,24 @@ def _fewer(model: Model) -> dict[str, Model]:
     return {f"{name} of the shapes": folding.specialise(model, blendshapes=int(x * count)) for name, x in parts.items()}
 
 
-def _network(model: Model, path: Path, int8: bool) -> Path:
-    """The predictor and the decoder alone: from pose inputs and code to the next code and the blend-shape weights."""
-    g = Graph(int8)
-    count, size = len(model.network.pose_mean), len(model.network.first)
+def given_features(model: Model, path: Path, *, int8: bool, whole: bool = True) -> Path:
+    """Psi spared what NCS and SNUG are spared in `peers.write`: pose inputs and skinning transforms are given.
+
+    Args:
+        whole: with blend shapes and skinning; else to the weights of the shapes.
+    """
+    g, network = Graph(int8), model.network
+    count, size, vertices = len(network.pose_mean), len(network.first), model.wearer.template.shape[1]
+    given, found = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
-    g("Identity", onnx.shape_weights(g, latent, model), name="weights")
-    given = {"inputs": (1, count), "latent": (1, size)}
-    g.save(path, given, {"next_latent": (1, size), "weights": (1, len(model.network.shapes))})
+    if whole:
+        given["transforms"], found["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
+        moved = g.skinned(onnx.canonical(g, latent, model), "transforms", network.weights)
+        g("Transpose", moved, perm=[0, 2, 1], name="vertices")
+    else:
+        found["weights"] = (1, len(network.shapes))
+        g("Identity", onnx.shape_weights(g, latent, model), name="weights")
+    g.save(path, given, found)
     return path
 
 

@@ -34,7 +34,7 @@ from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.types import Motion, Pose
 from experiments.benchmarks import peers
-from experiments.benchmarks.inference import bound, c_call, interleaved, onnx_call
+from experiments.benchmarks.inference import bound, c_call, given_features, interleaved, onnx_call, session_call
 from experiments.benchmarks.timing import Call
 from experiments.evaluate import SETTLING, skinned_trajectory, windows
 from experiments.session import progress
@@ -219,7 +219,11 @@ def _skinning(case: Case, folder: Path) -> Variant:
 
 
 def _psi(case: Case, run: Path, family: str, folder: Path) -> dict[str, Variant]:
-    """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer."""
+    """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
+
+    In ONNX Runtime it is timed as peers are, with pose inputs and skinning transforms given; and, as in C, from the
+    pose, which no peer does.
+    """
     folder = Path(tempfile.mkdtemp(dir=folder))
     model = inference.load(run, betas=np.asarray(case.character.betas))
     count = len(model.network.shapes)
@@ -234,7 +238,9 @@ def _psi(case: Case, run: Path, family: str, folder: Path) -> dict[str, Variant]
             path = onnx.to_onnx(form, folder / f"{len(variants)}.onnx", int8=int8)
             tracks = [_local(lambda m, p=path, f=form: onnx.run_onnx(p, f, m), clip) for clip in case.clips]
             label = f"{name}, int8" if int8 else name
-            variants[label] = Variant(family, "onnx", tracks, onnx_call(path, form))
+            spared = given_features(form, folder / "spared.onnx", int8=int8)
+            variants[label] = Variant(family, "onnx", tracks, session_call(spared))
+            variants[f"{label}, from the pose"] = Variant(family, "onnx", tracks, onnx_call(path, form))
         if library:
             path = native.to_c(form, folder / f"{len(variants)}.psi")
             tracks = [_local(lambda m, p=path: native.run_c(library, p, m), clip) for clip in case.clips]
