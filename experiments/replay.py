@@ -116,7 +116,8 @@ def _said(
         farthest = float(np.abs(was.cloth.position).max())
         betas = np.round(one.betas.astype(float), 2).tolist()
         lines.append(
-            f"  simulation {index}: {where}; betas {betas}; {material}; its farthest vertex {farthest:.2f} m from the root"
+            f"  simulation {index}: {where}; betas {betas}; {material}; its farthest vertex "
+            f"{farthest:.2f} m from the root"
         )
     return "\n".join(lines)
 
