@@ -22,6 +22,7 @@ from tqdm import tqdm
 from clothjax import checkpoint, devices, run_folder
 
 State = TypeVar("State")
+MAX_NONFINITE = 10  # skipped steps in a row that are put up with
 Metrics = dict[str, Any]
 
 
@@ -56,7 +57,7 @@ def fit(
     checkpoint_seconds: float = 120.0,
     keep: int = 3,
     report_seconds: float = 10.0,
-    max_nonfinite: int = 10,
+    max_nonfinite: int = MAX_NONFINITE,
 ) -> Fitted:
     """Trains to `steps`, going on from the directory's newest checkpoint if there is one.
 
@@ -174,13 +175,13 @@ def _calls(
             raise ValueError(f"`update` must return metrics [{steps_per_call}] with a `loss`, got {shapes}")
         if _step(state) != step + steps_per_call:
             raise ValueError(f"`update` went from step {step} to {_step(state)}, not {steps_per_call} steps on")
-        skipped = _check_finite(metrics, step, skipped, max_nonfinite)
+        skipped = check_finite(metrics, step, skipped, max_nonfinite)
         step += steps_per_call
         compile_seconds = returned - began if compile_seconds is None else 0.0
         yield _Call(state, step, metrics, seconds - compile_seconds, compile_seconds)
 
 
-def _check_finite(metrics: Metrics, step: int, skipped: int, allowed: int) -> int:
+def check_finite(metrics: Metrics, step: int, skipped: int, allowed: int) -> int:
     """The skipped steps in a row at the end of a call, given those before it.
 
     A step that was skipped did no harm, whatever its loss; one that was not and has no finite loss did.

@@ -261,18 +261,7 @@ def make_update(
         return found, jax.tree.map(lambda x: x[None], gradient)
 
     def one(clips: Clips, state: TrainingState, _):
-        begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
-        chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
-        simulations = jax.tree.map(lambda x: x[chosen], state.pool)
-        restart = jax.random.uniform(restart_key, (stage.batch,)) < stage.restart_probability
-        restart |= clips.remaining[simulations.frame] < frames
-
-        def restarted(simulations):
-            fresh = jax.vmap(lambda k: begin(k, scene, clips, config))(jax.random.split(begin_key, stage.batch))
-            return jax.tree.map(lambda a, b: _where(restart, a, b), fresh, simulations)
-
-        simulations = jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
-
+        chosen, simulations = turn(state, scene, clips, frames, config)
         (each, (cloth, terms, seen)), gradients = devices.shard(part, device_mesh)(
             simulations, state.params, state.statistics, state.step, clips
         )
@@ -316,6 +305,22 @@ def make_update(
 
     clips = devices.replicate(clips, device_mesh)
     return lambda state: update(state, clips)
+
+
+def turn(state: TrainingState, scene: Scene, clips: Clips, frames: int, config: Config) -> tuple[Array, Simulation]:
+    """The simulations [B] whose turn it is, and their places [B] in the pool; begun anew where that is due."""
+    stage = config.stage1
+    begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
+    chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
+    simulations = jax.tree.map(lambda x: x[chosen], state.pool)
+    restart = jax.random.uniform(restart_key, (stage.batch,)) < stage.restart_probability
+    restart |= clips.remaining[simulations.frame] < frames
+
+    def restarted(simulations):
+        fresh = jax.vmap(lambda k: begin(k, scene, clips, config))(jax.random.split(begin_key, stage.batch))
+        return jax.tree.map(lambda a, b: _where(restart, a, b), fresh, simulations)
+
+    return chosen, jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
 
 
 def losses_and_gradient(loss: Callable, params: dict, batch):

@@ -38,18 +38,17 @@ def mend(motion: Motion, body: Body, how: Bad) -> tuple[Motion, str]:
 
 def repaired(motion: Motion, body: Body) -> Motion:
     """The bad frames interpolated between those around them, as many more of these as it takes."""
-    count = len(motion.translation)
+    count, bad = len(motion.translation), bad_frames(motion, body)
     wrong, mended = np.zeros(count, bool), motion
     for _ in range(ROUNDS):
-        bad = bad_frames(mended, body)
-        if len(bad) == 0:
-            return mended
         wrong[bad] = True
         if mended is not motion:
             wrong |= np.r_[wrong[1:], False] | np.r_[False, wrong[:-1]]
         good = np.flatnonzero(~wrong)
         if len(good) < (1 - MOST) * count:
-            break
+            raise ValueError(
+                f"{len(bad_frames(motion, body))} of {count} frames are implausible, too many to repair: drop them"
+            )
         times = np.clip(np.arange(count), good[0], good[-1])
         rotations = np.stack(
             [
@@ -65,8 +64,12 @@ def repaired(motion: Motion, body: Body) -> Motion:
             np.where(keep[:, None], motion.translation, path),
             motion.fps,
         )
+        bad = bad_frames(mended, body)
+        if len(bad) == 0:
+            return mended
     raise ValueError(
-        f"{len(bad_frames(motion, body))} of {count} frames are implausible, too many to repair: drop them"
+        f"frames {bad_frames(motion, body).tolist()} are implausible, and what is before and after them too far apart "
+        "to be joined: drop them"
     )
 
 

@@ -93,7 +93,7 @@ class Vbd:
     """Newton's solver: vertex block descent, a block Gauss-Seidel method."""
 
     def __init__(self, scene: Scene, timestep: float, iterations: int):
-        newton, warp = _newton()
+        newton, warp = newton_and_warp()
         rest, (a, b, left, right) = at_rest(scene), scene.mesh.hinges.T
         mass = masses(scene)
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -physics.GRAVITY, 0.0))
@@ -188,7 +188,7 @@ def masses(scene: Scene) -> np.ndarray:
         return np.asarray(physics.vertex_areas(scene.flat, scene.mesh.faces)) * MATERIAL.density
 
 
-def _newton():
+def newton_and_warp():
     try:
         import warp
 

@@ -2,15 +2,18 @@
 
     python -m experiments.replay runs/mine                   # its last stage
     python -m experiments.replay runs/mine --stage stage1
+    python -m experiments.replay runs/mine --allowed 0       # the first step that was skipped, though training went on
 
-It starts from the last good checkpoint: resuming is exact, so what went wrong goes wrong again. Named are the terms
-that are not finite, and of each simulation of the batch its clip, frame, betas and material. The state before that step
-is kept in `RUN/<stage>/diverged/`, from where the next replay starts. Nothing else of the run is touched.
+It starts from the last good checkpoint and goes on until training would stop. Named are the terms that are not finite,
+and of each simulation of the batch its clip, frame, betas and material. The state before that step is kept in
+`RUN/<stage>/diverged/`, from where the next replay starts. Nothing else of the run is touched. Steps are compiled one
+by one here, and twenty together in training: what is at the edge of diverging may not do so again.
 """
 
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -21,6 +24,7 @@ from clothjax import (
     checkpoint,
     configuration,
     experiment,
+    fit,
     latent_predictor,
     rollout,
     stage1,
@@ -30,52 +34,80 @@ from clothjax import (
 from clothjax.clips import Clips
 from clothjax.config import Config
 from experiments.session import fail_clearly, progress, setup
-
-STAGES = ("stage1", "tuning")  # in which the physics is the loss
+from experiments.train import PHYSICS
 
 
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run", type=Path, help="folder of a run")
-    parser.add_argument("--stage", choices=STAGES, default=None, help="default: the last one begun")
+    parser.add_argument("--stage", choices=PHYSICS, default=None, help="default: the last one begun")
     parser.add_argument("--steps", type=int, default=2000, help="at the most; default 2000")
+    parser.add_argument(
+        "--allowed",
+        type=int,
+        default=fit.MAX_NONFINITE,
+        help="skipped steps in a row to put up with; default: as training",
+    )
     arguments = parser.parse_args(argv)
-    begun = [stage for stage in STAGES if checkpoint.steps(arguments.run / stage / "checkpoints")]
+    begun = [stage for stage in PHYSICS if checkpoint.steps(arguments.run / stage / "checkpoints")]
     if not begun or (arguments.stage and arguments.stage not in begun):
         raise ValueError(
-            f"{arguments.run}: has no checkpoint of {arguments.stage or ' or '.join(STAGES)} to start from"
+            f"{arguments.run}: has no checkpoint of {arguments.stage or ' or '.join(PHYSICS)} to start from"
         )
-    print(replay(arguments.run, arguments.stage or begun[-1], arguments.steps))
+    print(replay(arguments.run, arguments.stage or begun[-1], arguments.steps, arguments.allowed))
 
 
-def replay(run: Path, stage: str, steps: int) -> str:
-    """What the first step was made of whose loss or gradient is not finite."""
-    folder = run / stage
-    start = folder / "diverged" if checkpoint.steps(folder / "diverged") else folder / "checkpoints"
-    config = configuration.from_dict(Config, checkpoint.latest(start).config, str(start))
+def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
+    """What the first step was made of from which on more in a row than `allowed` were not finite.
+
+    Raises:
+        ValueError: if the stage has finished.
+    """
+    start, found = _start(run / stage)
+    config = configuration.from_dict(Config, found.config, str(start))
+    total = getattr(config, stage).steps
+    if found.step >= total:
+        raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")
     whole = experiment.assemble(config)
     reel, _ = experiment.training_clips(whole)
-    update, state, settings = _again(run, stage, whole, reel)
-    state, found = checkpoint.restore(start, state)
+    update, turn, state = _again(run, stage, whole, reel)
+    state, _ = checkpoint.restore(start, state)
     print(f"from step {found.step} of {start}", flush=True)
-    with progress("replaying", steps) as report:
-        for step in range(found.step, found.step + steps):
+    end, skipped = min(found.step + steps, total), 0
+    with progress("replaying", end - found.step) as report:
+        for step in range(found.step, end):
             before = jax.device_get(state)
             state, metrics = update(state)
-            metrics = {name: float(values[0]) for name, values in metrics.items()}
-            if metrics["nonfinite"] or not np.isfinite(metrics["loss"]):
-                kept = folder / "diverged" / str(step)
+            metrics = {name: np.asarray(values) for name, values in metrics.items()}
+            if not skipped:
+                first = step, before, metrics
+            try:
+                skipped = fit.check_finite(metrics, step, skipped, allowed)
+            except FloatingPointError as error:
+                step, before, metrics = first
+                kept = run / stage / "diverged" / str(step)
                 if not kept.is_dir():
-                    checkpoint.save(folder / "diverged", step, before, found.config)
-                return _said(step, metrics, before, state, settings, whole) + f"\nkept: {kept}"
+                    checkpoint.save(kept.parent, step, before, found.config)
+                return f"{error}\n{_said(step, metrics, turn(before), whole)}\nkept: {kept}"
             report(step + 1 - found.step)
-    return f"all of {steps} steps have finite losses and gradients; --steps takes more"
+    return f"steps {found.step + 1} to {end} of {total} do not diverge; --steps takes more of them"
+
+
+def _start(folder: Path) -> tuple[Path, checkpoint.Checkpoint]:
+    """Where to start from: the state that an earlier replay has kept, if it is of this training and later."""
+    usual, kept = folder / "checkpoints", folder / "diverged"
+    found = checkpoint.latest(usual)
+    if checkpoint.steps(kept):
+        before = checkpoint.latest(kept)
+        if before.step >= found.step and before.config == found.config:
+            return kept, before
+    return usual, found
 
 
 def _again(
     run: Path, stage: str, whole: experiment.Experiment, reel: Clips
-) -> tuple[Callable, stage1.TrainingState, Config]:
-    """The training step of a stage, a state of its structure, and the configuration that it reads."""
+) -> tuple[Callable, Callable, stage1.TrainingState]:
+    """The training step of a stage, what tells the simulations of a step, and a state."""
     config = whole.config
     kept = latent_predictor.kept_joints(whole.names, config.stage2)
     if stage == "tuning":
@@ -89,35 +121,38 @@ def _again(
         state = stage1.init_peer(whole.scene, reel, kept, blendshapes.laplacian(whole.scene, config), config)
     else:
         animator, state = rollout.phi, stage1.init(whole.scene, reel, config)
-    return stage1.make_curriculum(whole.scene, reel, config, 1, None, animator), state, config
+
+    @partial(jax.jit, static_argnums=1)
+    def turn(state: stage1.TrainingState, frames: int):
+        return stage1.turn(state, whole.scene, reel, frames, config)
+
+    update = stage1.make_curriculum(whole.scene, reel, config, 1, None, animator)
+    return update, lambda state: turn(state, stage1.rollout_length(int(state.step), config)), state
 
 
 def _said(
     step: int,
-    metrics: dict[str, float],
-    before: stage1.TrainingState,
-    after: stage1.TrainingState,
-    config: Config,
+    metrics: fit.Metrics,
+    simulations: tuple[np.ndarray, stage1.Simulation],
     whole: experiment.Experiment,
 ) -> str:
     """A bad step for a reader."""
-    wrong = [name for name, value in metrics.items() if not np.isfinite(value)]
-    lines = [f"step {step + 1}: not finite: {', '.join(wrong) or 'the gradient alone'}"]
-    clips = {name: len(experiment.motion(whole, name).translation) for name in experiment.training_motions(config)}
+    wrong = [name for name, values in metrics.items() if not np.isfinite(values[0])]
+    lines = [f"step {step + 1}: not finite: {', '.join(wrong)}"]
+    clips = {
+        name: len(experiment.motion(whole, name).translation) for name in experiment.training_motions(whole.config)
+    }
     begin = np.concatenate([[0], np.cumsum(list(clips.values()))])
-    for index in (step * config.stage1.batch + np.arange(config.stage1.batch)) % config.stage1.pool:
-        one, was = (jax.tree.map(lambda x, i=index: np.asarray(x[i]), state.pool) for state in (after, before))
+    numbers, of_them = jax.device_get(simulations)
+    for index, number in enumerate(numbers):
+        one = jax.tree.map(lambda x, i=index: x[i], of_them)
+        clip = int(np.searchsorted(begin, one.frame, side="right")) - 1
         material = ", ".join(f"{name} {value:.4g}" for name, value in one.material._asdict().items())
-        if not np.array_equal(one.betas, was.betas) or one.material != was.material:
-            where = "begun anew in this step"
-        else:
-            clip = int(np.searchsorted(begin, was.frame, side="right")) - 1
-            where = f"frame {int(was.frame) - begin[clip]} of {list(clips)[clip]}"
-        farthest = float(np.abs(was.cloth.position).max())
         betas = np.round(one.betas.astype(float), 2).tolist()
+        farthest = np.linalg.norm(one.cloth.position, axis=-1).max()
         lines.append(
-            f"  simulation {index}: {where}; betas {betas}; {material}; its farthest vertex "
-            f"{farthest:.2f} m from the root"
+            f"  simulation {number}: {'new, ' * bool(one.fresh)}frame {int(one.frame) - begin[clip]} of "
+            f"{list(clips)[clip]}; betas {betas}; {material}; its farthest vertex {farthest:.2f} m from the root"
         )
     return "\n".join(lines)
 

@@ -48,6 +48,7 @@ from clothjax.latent_predictor import Normalizers
 from experiments.session import fail_clearly, progress, setup
 
 STEPS_PER_CALL = 20
+PHYSICS = ("stage1", "tuning")  # stages in which the physics is the loss
 
 
 def main(argv: list[str]) -> None:
@@ -65,7 +66,10 @@ def main(argv: list[str]) -> None:
         try:
             train(config, directory, devices.choose(wanted, *batches))
         except FloatingPointError as error:
-            hint = f"`python -m experiments.replay {directory}` shows what the bad step was made of"
+            *_, stage = [stage for stage in trained.STAGES if (directory / stage).is_dir()]
+            if stage not in PHYSICS or not checkpoint.steps(directory / stage / "checkpoints"):
+                raise
+            hint = f"`python -m experiments.replay {directory} --stage {stage}` shows what the bad step was made of"
             raise FloatingPointError(f"{error}; {hint}") from error
 
 

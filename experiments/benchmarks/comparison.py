@@ -1,4 +1,7 @@
-"""Two reports of the benchmark beside each other: what has become slower or faster by more than noise."""
+"""Two reports of the benchmark beside each other: what has become slower or faster by more than noise.
+
+The noise is that of medians: what was measured once, as a compilation or a closed loop of Phi, may differ by more.
+"""
 
 import math
 
@@ -31,7 +34,8 @@ def times(part, place: str = "", timed: bool = False) -> dict[str, float]:
         found = {}
         for key, value in part.items():
             below = f"{place}/{key}" if place else key
-            found |= times(value, below, timed or bool(TIMES & set(key.split("_"))))
+            of_time = bool(TIMES & set(key.split("_"))) and not key.endswith("_ratio")
+            found |= times(value, below, timed or of_time)
         return found
     if isinstance(part, list):
         found = {}

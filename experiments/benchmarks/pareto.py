@@ -33,8 +33,9 @@ from clothjax.experiment import Experiment
 from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.types import Motion, Pose
-from experiments.benchmarks import peers
+from experiments.benchmarks import peers, position_based
 from experiments.benchmarks.inference import bound, c_call, given_features, interleaved, onnx_call, session_call
+from experiments.benchmarks.position_based import Xpbd
 from experiments.benchmarks.timing import Call
 from experiments.evaluate import SETTLING, skinned_trajectory, windows
 from experiments.session import progress
@@ -45,6 +46,7 @@ import matplotlib.pyplot as plt
 
 DESCENT_STEPS = (1, 4, 16, 32)  # of Phi
 ITERATIONS = (1, 2, 4, 8, 500)  # of the solver, of which the last is until it has converged
+XPBD = ((16, 4), (32, 2), (64, 1))  # substeps, iterations of each; with fewer of both it is not stable
 SHAPES = {"a half": 1 / 2, "a quarter": 1 / 4, "an eighth": 1 / 8}  # of the blend shapes
 USABLE = 1.1  # errors of NCS in a smaller form, over those of the form that was trained
 ALIKE = ("body", "fps", "physics", "material", "motions")  # of the configurations of what is compared
@@ -55,9 +57,9 @@ ERRORS = {
 }
 COLOURS = {
     "skinning": "gray", "psi": "tab:blue", "phi": "tab:green", "ncs": "tab:red", "snug": "tab:orange",
-    "direct": "tab:purple", "solver": "black",
+    "direct": "tab:purple", "xpbd": "tab:brown", "solver": "black",
 }  # fmt: skip
-MARKERS = {"onnx": "o", "c": "^", "jax": "s"}
+MARKERS = {"onnx": "o", "c": "^", "jax": "s", "warp": "D"}
 LEAST = {"energy_gap": 1e-5, "step_error_mm": 1e-3, "swing_error": 1e-3}  # where the plots begin
 
 
@@ -101,7 +103,7 @@ def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tupl
             variants, solved = _every(case, of_it, Path(folder))
             us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
             for key, each in variants.items():
-                found = {"name": key[1], "run": key[0], "family": each.family, "garment": garment}
+                found = {"name": key[1], "run": _short(key[0]), "family": each.family, "garment": garment}
                 found |= {"runtime": each.runtime, "us": us.get(key, each.us), "converged": each.converged}
                 points.append(found | _errors(case, each.tracks, solved, gaps))
             report(index + 1)
@@ -109,6 +111,11 @@ def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tupl
         others = [p for p in points if p["garment"] == point["garment"]]
         point["front"] = {error: not any(_better(other, point, error) for other in others) for error in ERRORS}
     return {"points": points} | wins(points)
+
+
+def _short(run: str) -> str:
+    """A run as it is called on every machine: a garment of the library by its name."""
+    return Path(run).name if run and trained.packed(run) else run
 
 
 def wins(points: list[dict]) -> dict:
@@ -129,6 +136,8 @@ def wins(points: list[dict]) -> dict:
             continue
         won["compared"].append(garment)
         whole = theirs["ncs"]
+        if not all(np.isfinite(whole[error]) for error in ERRORS):
+            raise ValueError(f"the errors of NCS on {garment} are not finite: its training diverged; train it again")
         usable = [p for p in theirs.values() if all(p[error] <= USABLE * whole[error] for error in ERRORS)]
         fastest = min(usable, key=lambda p: p["us"])
         in_time = [p for p in ours.values() if p["us"] <= fastest["us"]]
@@ -149,14 +158,15 @@ def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
     }
 
 
-def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float]:
-    """Kendall's tau of the order of the points that two reports have in common, by time and by each error."""
+def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
+    """Of so many `points` that two reports have in common, Kendall's tau of their order by time and by each error."""
     named = {(p["garment"], p["run"], p["name"]): p for p in others}
     pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
-    return {
-        key: float(kendalltau([one[key] for one, _ in pairs], [other[key] for _, other in pairs]).statistic)
-        for key in ("us", *ERRORS)
-    }
+    found = {"points": len(pairs)}
+    for key in ("us", *ERRORS):
+        tau = float(kendalltau([one[key] for one, _ in pairs], [other[key] for _, other in pairs]).statistic)
+        found[key] = tau if np.isfinite(tau) else None  # all alike have no order
+    return found
 
 
 def _better(one: dict, other: dict, error: str) -> bool:
@@ -203,7 +213,8 @@ def _every(case: Case, runs: list[Path], folder: Path) -> tuple[dict[tuple[str, 
             found |= {} if network else _phi(case, run)
         variants |= {(str(run), name): each for name, each in found.items()}
     solver, solved = _solver(case)
-    return variants | {("", name): each for name, each in solver.items()}, solved
+    others = solver | _position_based(case, [track[0] for track in solved])
+    return variants | {("", name): each for name, each in others.items()}, solved
 
 
 def _skinning(case: Case, folder: Path) -> Variant:
@@ -258,6 +269,7 @@ def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
 def _phi(case: Case, run: Path) -> dict[str, Variant]:
     """Phi with more and fewer steps of its descent, in jax."""
     config, model = trained.phi(run)
+    case = case._replace(whole=experiment.assemble(config))  # with the graph that it was trained on
     if config.model.latent_update != "descent":
         return {"phi": _loop(case, config, model)}
     varied = {
@@ -306,7 +318,10 @@ def _peer(case: Case, run: Path, folder: Path) -> dict[str, Variant]:
         return [{name: x[t] for name, x in seen.items()} for t in range(len(clip.translation) - 2)]
 
     coding = peers.write(folder / "codes.onnx", peer, whole=False)
-    usual = [experiment.motion(whole, name) for name in folding.CLIPS]
+    try:
+        usual = [experiment.motion(whole, name) for name in folding.CLIPS]
+    except ValueError:  # for another body
+        usual = case.clips
     codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])
     forms = {network: peer}
     forms |= {
@@ -347,6 +362,25 @@ def _solver(case: Case) -> tuple[dict[str, Variant], list[np.ndarray]]:
         variants[name] = Variant("solver", "jax", tracks, None, float(np.median(us)), float(np.mean(converged)))
         solved = tracks
     return variants, solved
+
+
+def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
+    """XPBD, from where the solver starts; nothing where Newton is not installed."""
+    variants, whole = {}, case.whole
+    for substeps, iterations in XPBD:
+        try:
+            engine = Xpbd(whole, case.character, substeps, iterations)
+        except ImportError as error:
+            print(f"no points of XPBD: {error}")
+            return {}
+        loops = [
+            position_based.simulate(engine, whole, case.character, windows(clip), start)
+            for clip, start in zip(case.clips, starts, strict=True)
+        ]
+        tracks, us = zip(*loops)
+        name = f"xpbd, {substeps} substeps of {iterations} iteration{'s' * (iterations > 1)}"
+        variants[name] = Variant("xpbd", "warp", list(tracks), None, float(np.median(us)))
+    return variants
 
 
 def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps: int) -> dict[str, float]:
