@@ -9,18 +9,19 @@ from packaging.requirements import Requirement
 
 COMMANDS = {
     "data": "data_prep.anny: makes the embedded body anew",
-    "export": "experiments.convert, experiments.benchmark: ONNX, safetensors",
-    "render": "experiments.render, experiments.quickstart: pictures, glTF, USD, video",
+    "export": "experiments.convert, experiments.benchmark, experiments.thesis: ONNX, safetensors",
+    "render": "experiments.render, gallery, quickstart, benchmark, stability, thesis: pictures, glTF, USD, video",
     "sweep": "experiments.sweep: several trainings at once",
     "demo": "experiments.demo: the live page",
     "docs": "make docs: the reference of the library",
-    "compare": "experiments.compare_solvers: beside NVIDIA Newton",
+    "compare": "experiments.compare_solvers, XPBD in experiments.benchmark: beside NVIDIA Newton",
     "dev": "make test",
 }
-PROGRAMS = {
-    "cc": ("a C compiler", "the plain C runtime, and jax that calls it"),
-    "node": ("Node.js", "experiments.web, and its tests"),
-    "chromium": ("Chromium", "the tests of the demo and of the web page"),
+PROGRAMS = {  # by what they are: their names, and what needs them
+    "C": (("cc", "gcc", "clang"), "the plain C runtime"),
+    "C++": (("c++", "g++", "clang++"), "jax that calls the plain C runtime"),
+    "Node.js": (("npm",), "experiments.web, and its tests"),
+    "Chromium": (("chromium", "google-chrome"), "the tests of the demo and of the web page"),
 }
 
 
@@ -42,9 +43,10 @@ def report() -> tuple[list[str], bool]:
         absent = [each.name for each in wanted if not _met(each)]
         state = f"without {', '.join(absent)}: pip install 'clothjax[{extra}]'" if absent else "ready"
         lines.append(f"  {extra:8} {state:60} {COMMANDS.get(extra, '')}".rstrip())
-    for program, (name, use) in PROGRAMS.items():
-        found = shutil.which(program)
-        lines.append(f"  {program:8} {found or f'{name} is not on the PATH':60} {use}")
+    for program, (names, use) in PROGRAMS.items():
+        found = next(filter(None, map(shutil.which, names)), None)
+        absent = f"no {' or '.join(names)} on the PATH"
+        lines.append(f"  {program:8} {found or absent:60} {use}")
     garments, sound = _garments()
     return [*lines, "", *garments], sound and running
 

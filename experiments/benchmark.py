@@ -5,7 +5,7 @@
     python -m experiments.benchmark --compare old.json                             # ratios, and what is beyond noise
     python -m experiments.benchmark --part stage1                                  # the paper's Phi, 4 000 vertices
     python -m experiments.benchmark --part inference                               # Psi on one thread, beside NCS
-    python -m experiments.benchmark tshirt runs/ncs --part pareto                  # error against time
+    python -m experiments.benchmark runs/thesis/tshirt/{ours,ncs} --part pareto    # error against time
 
 Every time is the median of rounds in which all variants take turns; `noise` is the factor by which such a median
 differs from itself. The plots are named after the parts (`benchmark.stage1.png`).

@@ -1,4 +1,4 @@
-"""What the documents tell users to type does what they say: every block of code in them is run."""
+"""What the documents tell users to type works: the blocks of code in them are run, but for what cannot be had here."""
 
 import os
 import pickle

@@ -51,7 +51,9 @@ def test_the_order_of_two_runs():
     one = [point("psi", float(i), 10.0 - i, name=str(i // 2), run=str(i % 2)) for i in range(5)]
     same = [p | {"us": 3.0 * p["us"]} for p in one[::-1]]
     found = pareto.rank_tau(one, [*same, point("ncs", 1.0, 1.0)])
+    assert found.pop("points") == 5
     assert set(found) == {"us", *pareto.ERRORS} and min(found.values()) == pytest.approx(1.0)
+    assert pareto.rank_tau(one, [p | {"energy_gap": 0.0} for p in one])["energy_gap"] is None
     swapped = [p | {"us": -p["us"]} for p in one]
     assert pareto.rank_tau(one, swapped)["us"] == pytest.approx(-1.0)
 
