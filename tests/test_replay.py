@@ -47,13 +47,13 @@ def test_the_first_bad_step_is_named_and_kept(tmp_path, monkeypatch, capsys):
     path.write_text("garment: tshirt_1000")
     run = tmp_path / "run"
     (run / "stage1").mkdir(parents=True)
-    with pytest.raises(FloatingPointError, match="diverged$"):  # there is nothing yet to replay
+    with pytest.raises(FloatingPointError, match=r"diverged$"):  # there is nothing yet to replay
         train.main([str(path), "--directory", str(run)])
     shutil.copytree(tmp_path / "stage1", run / "stage1", dirs_exist_ok=True)
     with pytest.raises(FloatingPointError, match=r"experiments\.replay .*run --stage stage1"):
         train.main([str(path), "--directory", str(run)])
     (run / "stage2").mkdir()
-    with pytest.raises(FloatingPointError, match="diverged$"):  # no physics
+    with pytest.raises(FloatingPointError, match=r"diverged$"):  # no physics
         train.main([str(path), "--directory", str(run)])
 
 
