@@ -29,7 +29,8 @@ SHORT = [  # what makes long commands short, and no other difference
 ]
 SMALL = (
     "--shapes.sequences 0 --model.descent_samples 0 --model.width 8 --model.blendshapes 24 --stage1.steps 20 "
-    "--stage2.steps 20 --stage2.sequences 2 --stage2.frames 8 --stage2.rollout 2 --evaluation.frames 30 "
+    "--stage2.steps 20 --stage2.sequences 2 --stage2.frames 8 --stage2.rollout 2 --tuning.steps 20 --tuning.pool 2 "
+    "--evaluation.frames 30 "
     "--evaluation.gap_frames 1 --evaluation.solver_frames 20 --evaluation.long_frames 40"
 )
 NOT_HERE = {  # what a test cannot have, and why

@@ -87,9 +87,8 @@ def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> di
     loops = {"long": measure(whole, character, play(usual, experiment.there_and_back(clip, frames)))}
 
     for scale in (0.5, 2.0):
-        model = replace(
-            usual, joints=scale * usual.joints, garment=usual.garment._replace(vertices=scale * usual.garment.vertices)
-        )
+        wearer = usual.wearer
+        model = replace(usual, wearer=wearer._replace(joints=scale * wearer.joints, template=scale * wearer.template))
         larger = character._replace(template=scale * character.template)
         scaled = short._replace(translation=scale * short.translation)
         loops[f"body scale {scale:g}"] = measure(whole, larger, play(model, scaled))
