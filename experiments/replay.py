@@ -122,12 +122,12 @@ def _again(
     else:
         animator, state = rollout.phi, stage1.init(whole.scene, reel, config)
 
-    @partial(jax.jit, static_argnums=1)
-    def turn(state: stage1.TrainingState, frames: int):
+    @partial(jax.jit, static_argnums=2)
+    def turn(state: stage1.TrainingState, reel: Clips, frames: int):
         return stage1.turn(state, whole.scene, reel, frames, config)
 
     update = stage1.make_curriculum(whole.scene, reel, config, 1, None, animator)
-    return update, lambda state: turn(state, stage1.rollout_length(int(state.step), config)), state
+    return update, lambda state: turn(state, reel, stage1.rollout_length(int(state.step), config)), state
 
 
 def _said(
