@@ -191,7 +191,7 @@ def save_body(
         "faces": np.int32(body.faces),
         "joints": np.float32(body.joints),
         "parents": np.int32(body.parents),
-        "joint_names": np.array(list(joint_names), dtype=h5py.string_dtype()),
+        "joint_names": _strings(joint_names),
         **_sparse(body.weights),
         "shapedirs": np.float32(body.shapedirs),
         "joint_shapedirs": np.float32(body.joint_shapedirs),
@@ -224,7 +224,7 @@ def save_motion(
     data = {
         "poses": np.float32(poses),
         "trans": np.float64(motion.translation),
-        "joint_names": np.array(list(joint_names), dtype=h5py.string_dtype()),
+        "joint_names": _strings(joint_names),
     }
     _write(path, "motion", data, fps=float(motion.fps), name=name, source=source, licence=licence)
 
@@ -239,12 +239,13 @@ def _open(path: str | Path, kind: str) -> Iterator[h5py.File]:
         raise ValueError(f"{path}: no such file")
     try:
         with h5py.File(path, "r") as file:
-            form = str(file.attrs.get("format", "missing"))
+            form = str(_decoded(file.attrs.get("format", "missing")))
             if kind and form.rpartition("/")[2] != kind:
                 raise ValueError(f"{path}: attribute 'format' is {form!r}, expected 'clothjax/{kind}'")
             for key, wanted in (("version", VERSION), ("units", "m"), ("up", "+Y")):
-                if file.attrs.get(key, wanted) != wanted:
-                    raise ValueError(f"{path}: attribute {key!r} is {file.attrs[key]!r}, expected {wanted!r}")
+                found = _decoded(file.attrs.get(key, wanted))
+                if found != wanted:
+                    raise ValueError(f"{path}: attribute {key!r} is {found!r}, expected {wanted!r}")
             yield file
     except (OSError, RuntimeError, KeyError) as error:  # what h5py raises for a damaged file
         raise ValueError(f"{path}: not a readable HDF5 file, perhaps cut short ({error})") from error
@@ -339,7 +340,17 @@ def _sparse(weights: np.ndarray) -> dict[str, np.ndarray]:
 
 def _names(file: h5py.File, sizes: dict[str, int]) -> tuple[str, ...]:
     names = _dataset(file, "joint_names", ("J",), sizes)
-    return tuple(n.decode() if isinstance(n, bytes) else str(n) for n in names)
+    return tuple(str(_decoded(n)) for n in names)
+
+
+def _decoded(value: object) -> object:
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
+def _strings(values: Sequence[str]) -> np.ndarray:
+    """Of one length, so that they stand in the dataset itself; HDF5 keeps others in a heap that no sum checks."""
+    encoded = [value.encode() for value in values]
+    return np.array(encoded, h5py.string_dtype("utf-8", max(map(len, encoded), default=0) or 1))
 
 
 def _check_parents(file: h5py.File, parents: np.ndarray) -> None:
@@ -374,13 +385,13 @@ def _write(path: str | Path, kind: str, data: dict[str, np.ndarray], **attribute
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        # of this version all that describes the data is checked by sums: libhdf5 can crash where it is damaged
+        # of this version all of a file is checked by sums: libhdf5 can crash where what describes the data is damaged
         with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             fixed = {"format": f"clothjax/{kind}", "version": VERSION, "units": "m", "up": "+Y"}
-            file.attrs.update({**fixed, **attributes})
+            for key, value in {**fixed, **attributes}.items():
+                file.attrs[key] = _strings([value])[0] if isinstance(value, str) else value
             for key, value in data.items():
-                summed = np.asarray(value).dtype.kind in "biuf"
-                options = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": summed}
+                options = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": True}
                 file.create_dataset(key, data=value, **options)
         os.replace(partial, path)
     finally:

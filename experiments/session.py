@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import logging
 import os
 import sys
 import time
@@ -34,6 +35,7 @@ def fail_clearly() -> Iterator[None]:
         hint = (
             "; make room, and run the same command again: a training goes on from its last checkpoint" if full else ""
         )
+        logging.getLogger("asyncio").disabled = True  # what Orbax left would be said after what matters
         print(f"error: {error}{hint}", file=sys.stderr)
         raise SystemExit(1) from None
 

@@ -637,37 +637,52 @@ def test_a_mistake_gets_one_clear_error_and_loses_nothing(name, tmp_path, capsys
 
 FULL = """
 import resource, sys
+from functools import partial
 from test_bad_input import settings
 from pathlib import Path
+from clothjax import checkpoint, fit
 from experiments import train
 from experiments.session import fail_clearly
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), -1))
+save = checkpoint.save
+def onto_a_full_disk(directory, step, *args, **options):
+    if Path(directory).parent.name == "stage2" and step > int(sys.argv[2]):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, -1))
+    save(directory, step, *args, **options)
+checkpoint.save = onto_a_full_disk
+fit.fit = partial(fit.fit, checkpoint_seconds=0.0)
 with fail_clearly():
-    train.main([str(settings(Path(sys.argv[1]))), "--directory", sys.argv[1] + "/run", "--stage2.steps", "20"])
+    train.main([str(settings(Path(sys.argv[1]))), "--directory", sys.argv[1] + "/run"])
 """
 
 
 @pytest.mark.slow
 def test_a_full_disk_loses_nothing(tmp_path):
-    """A limit on the size of files stands for a disk that is full: writing fails in the same place."""
+    """A limit on the size of files stands for a disk that is full: writing fails in the same place. So it does at the
+    first checkpoint of a stage, and at one that has another before it."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
 
-    def run(limit: int) -> subprocess.CompletedProcess:
-        command = [sys.executable, "-c", FULL, str(tmp_path), str(limit)]
+    def run(room_until: int) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-c", FULL, str(tmp_path), str(room_until)]
         return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
 
-    whole = run(2**40)
-    assert whole.returncode == 0, whole.stderr
-    run_at = tmp_path / "run" / "stage2"
-    kept = contents(tmp_path / "run" / "stage1")
-    shutil.rmtree(run_at)
-    full = run(20_000)
-    last = full.stderr.strip().splitlines()[-1]  # before it, what Orbax and jax write themselves
-    assert full.returncode == 1 and re.search(r"^error: .*stage2.*could not be written.*make room", last), full.stderr
-    assert {path: data for path, data in contents(tmp_path / "run" / "stage1").items() if "checkpoints" in path} == {
-        path: data for path, data in kept.items() if "checkpoints" in path
-    }
-    assert run(2**40).returncode == 0
+    def checkpoints() -> dict[str, bytes]:
+        files = contents(tmp_path / "run")
+        return {path: files[path] for path in files if "checkpoints" in path and "checkpoint-tmp" not in path}
+
+    stage2 = tmp_path / "run" / "stage2" / "checkpoints"
+    kept: dict[str, bytes] = {}
+    for room_until in (0, 20):
+        full = run(room_until)
+        last = full.stderr.strip().splitlines()[-1]  # before it, what Orbax and jax write themselves
+        said = re.search(r"^error: .*stage2.*could not be written.*make room", last)
+        assert full.returncode == 1 and said, full.stderr
+        left = checkpoints()
+        assert {path: left.get(path) for path in kept} == kept
+        kept = left
+        assert checkpoint.steps(stage2) == [20] * (room_until == 20)
+    again = run(2**40)
+    assert again.returncode == 0, again.stderr
+    assert checkpoint.steps(stage2)[-1] == 40
 
 
 def test_there_are_sixty_mistakes():
