@@ -110,7 +110,9 @@ def _array(value) -> np.ndarray:
     if isinstance(value, _Sparse):
         state = value.state
         shape = state["_shape"] if "_shape" in state else state["shape"]
-        value = scipy.sparse.csc_matrix((state["data"], state["indices"], state["indptr"]), shape).toarray()
+        value = scipy.sparse.csc_matrix((state["data"], state["indices"], state["indptr"]), shape)
+        value.check_format(full_check=True)  # scipy would write where a wrong index says
+        value = value.toarray()
     return np.asarray(value)
 
 
@@ -132,6 +134,8 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
         if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
             wanted = " x ".join("any" if n is None else str(n) for n in shape)
             raise ValueError(f"{path}: {key} has shape {array.shape}, expected {wanted}")
+        if not array.size:
+            raise ValueError(f"{path}: {key} is empty")
         if not np.isfinite(array).all():
             raise ValueError(f"{path}: {key} has an entry that is not finite")
         return array

@@ -122,6 +122,15 @@ def test_a_pickle_that_wants_all_memory_is_refused(model, tmp_path):
         smpl.body(path)
 
 
+def test_a_sparse_array_that_reaches_out_of_itself_is_refused(model, tmp_path):
+    path = tmp_path / "far.pkl"
+    regressor = model["J_regressor"].tocsc()
+    regressor.indices = regressor.indices + 2**24
+    path.write_bytes(pickle.dumps(model | {"J_regressor": regressor}))
+    with pytest.raises(ValueError, match=r"far\.pkl: .*ind"):
+        smpl.body(path)
+
+
 def test_a_truncated_file_is_refused_wherever_it_ends(published):
     whole = published.read_bytes()
     for end in np.linspace(0, len(whole) - 1, 40).astype(int):
@@ -138,6 +147,7 @@ def test_a_truncated_file_is_refused_wherever_it_ends(published):
         ("v_template", np.ones((642, 2)), r"v_template has shape \(642, 2\)"),
         ("v_template", np.full((642, 3), np.nan), "v_template has an entry that is not finite"),
         ("f", np.full((5, 3), 642), "a face names vertex 642 of 642"),
+        ("f", np.zeros((0, 3)), "f is empty"),
         ("kintree_table", np.array([range(24), range(24)]), "a parent does not come before its child"),
         ("J_regressor", np.ones((23, 642)), "J_regressor has shape"),
         ("shapedirs", np.array("x"), "shapedirs is not of numbers"),
