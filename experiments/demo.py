@@ -4,9 +4,9 @@
     python -m experiments.demo --garment dress --port 8080
     python -m experiments.demo --run runs/my_skirt --motions clips/*.motion.h5
 
-Arrow keys: up walks, then runs; down slows; left and right turn; space jumps, if there is a clip called jump. The panel
-has the same, the garment, body and cloth, and what stands beside Psi: plain skinning, its teacher Phi, and the solver,
-for which all others then wait.
+Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the
+arrows are the viewer's own, for its camera. The panel has the same as the keys, the garment, body and cloth, and what
+stands beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
 """
 
 import argparse
@@ -22,7 +22,7 @@ import numpy as np
 from clothjax import metrics, motion_matching, storage, trained
 from clothjax.features import scaled, unscaled
 from clothjax.types import Material, Motion
-from experiments.live import STAGES, TURN, Show, finer, strain
+from experiments.live import APART, STAGES, TURN, Show, finer, strain
 from experiments.session import fail_clearly, setup
 
 CLIPS = tuple(f"{family}_{i}" for family in ("walk", "run", "arms", "jump", "twist", "dance") for i in range(4))
@@ -56,17 +56,18 @@ class Viewer:
         self.floor = server.scene.add_grid(
             "/floor", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=GRID, infinite_grid=True
         )
-        server.initial_camera.position, server.initial_camera.look_at = (1.5, 1.5, 2.7), (0.0, 0.9, 0.0)
+        # the panel takes the right of the page
+        server.initial_camera.position, server.initial_camera.look_at = (0.6, 1.4, 3.1), (0.4, 0.85, 0.0)
         gui, steering = server.gui, show.steering
         with gui.add_folder("Steer"):
-            self._button("Faster", steering.faster, "arrowup", "arrow up")
-            self._button("Slower", steering.slower, "arrowdown", "arrow down")
-            self._button("Left", lambda: steering.turn(TURN), "arrowleft", "arrow left")
-            self._button("Right", lambda: steering.turn(-TURN), "arrowright", "arrow right")
+            self._button("Faster", steering.faster, "I")
+            self._button("Slower", steering.slower, "K")
+            self._button("Left", lambda: steering.turn(TURN), "J")
+            self._button("Right", lambda: steering.turn(-TURN), "L")
             for name in show.player.clips.families:
                 if name not in show.player.wander:
                     key = "space" if name == "jump" else None
-                    self._button(name.capitalize(), lambda name=name: steering.do(name, show.frames + ACTION), key, key)
+                    self._button(name.capitalize(), lambda name=name: steering.do(name, show.frames + ACTION), key)
         with gui.add_folder("Garment"):
             self.garment = gui.add_dropdown("Garment", tuple(garments), initial_value=garment)
             config = show.outfit.model.config
@@ -94,8 +95,9 @@ class Viewer:
         for control in (self.body, self.wireframe, self.points, self.follow):
             control.on_update(lambda _: setattr(self, "_draw_anew", True))
 
-    def _button(self, label: str, act: Callable, hotkey: str | None = None, hint: str | None = None) -> None:
-        self.server.gui.add_button(label, hint=hint).on_click(lambda _: act())
+    def _button(self, label: str, act: Callable, hotkey: str | None = None) -> None:
+        shown = label if hotkey is None else f"{label} ({hotkey})"
+        self.server.gui.add_button(shown).on_click(lambda _: act())
         if hotkey:
             self.server.gui.add_command(label, hotkey=hotkey).on_trigger(lambda _: act())
 
@@ -112,7 +114,10 @@ class Viewer:
                 due = time.perf_counter()
                 continue
             self._one_more = False
-            self.show.stages = tuple(name for name in STAGES if self.stages[name].value)
+            stages = tuple(name for name in STAGES if self.stages[name].value)
+            if set(stages) - set(self.show.stages) - {"psi"}:
+                self.text.content = "Compiling what stands beside Psi: up to a minute, the first time"
+            self.show.stages = stages
             self._shown = self.show.frame()
             began = time.perf_counter()
             self._draw()
@@ -148,11 +153,14 @@ class Viewer:
         others = [stage for stage in garments if stage != "psi"]
         worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :]))
         here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
+        here = here + [0.65 * APART * len(others), 0, 0]  # all in what the panel leaves free
         drawn = set()
         with self.server.atomic():
             self.floor.position = tuple(-(here % GRID))
             for stage, crowd in garments.items():
                 faces, rest = self.show.outfit.mesh(stage)
+                if others:
+                    drawn.add(self._label(stage, worn_by[stage] - here))
                 for i, vertices in enumerate(crowd):
                     drawn.add(self._mesh(f"/{stage}/{i}", vertices - here, faces, COLOURS[stage]))
                 if self.points.value == "strain":
@@ -175,6 +183,17 @@ class Viewer:
             wires = self.wireframe.value and not name.startswith("/body")
             self.meshes[name] = self.server.scene.add_mesh_simple(
                 name, vertices, faces, color=colour, side="double", wireframe=wires
+            )
+        return name
+
+    def _label(self, stage: str, body: np.ndarray) -> str:
+        """What a stage is called, over its head."""
+        name, place = f"/{stage}/name", (body[:, 0].mean(), body[:, 1].max() + 0.1, body[:, 2].mean())
+        if name in self.meshes:
+            self.meshes[name].position = place
+        else:
+            self.meshes[name] = self.server.scene.add_label(
+                name, stage.capitalize(), position=place, anchor="bottom-center"
             )
         return name
 

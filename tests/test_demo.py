@@ -185,7 +185,11 @@ def test_the_panel_reaches_what_is_shown(viewer):
     np.testing.assert_allclose(viewer.show._shape[0], large, atol=1e-5)
     viewer.points.value, viewer.stages["skinning"].value, viewer.body.value = "strain", True, False
     viewer.run(2)
-    assert set(viewer.meshes) == {"/psi/0", "/psi/strain", "/skinning/0", "/skinning/strain"}
+    assert set(viewer.meshes) == {
+        f"/{stage}/{part}" for stage in ("psi", "skinning") for part in ("0", "strain", "name")
+    }
+    here, there = (np.array(viewer.meshes[f"/{stage}/name"].position) for stage in ("psi", "skinning"))
+    np.testing.assert_allclose(there - here, [live.APART, 0, 0], atol=1e-5)
 
 
 def test_what_is_inside_the_body_is_red(viewer):
@@ -241,7 +245,7 @@ def test_a_browser_steers_and_sees_the_garment_move(tmp_path):
             page.get_by_text("frames a second").wait_for(timeout=30000)
             print(f"interactive {time.perf_counter() - began:.1f} s after the command")
             pictures = [page.screenshot(path=tmp_path / "0.png")]
-            page.keyboard.press("ArrowUp")
+            page.keyboard.press("i")
             time.sleep(3)
             pictures.append(page.screenshot(path=tmp_path / "1.png"))
             page.keyboard.press("Space")
