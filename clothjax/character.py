@@ -57,15 +57,20 @@ def dress(scene: Scene, betas: Array | None, material: Material, config: Physics
 
 
 def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Rest, Array]:
-    """What the betas decide: template, body, joints, rest measures, and the areas [V] m^2 of the vertices."""
+    """What the betas decide: template, body, joints, rest measures, and the areas [V] m^2 of the vertices, all
+    weighted by the garment's cloth."""
     template = skinning.shaped_vertices(scene.garment, betas)
     measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
+    rest = physics.rest_measures(measured, scene.mesh, flat=config.flat_hinges)
+    areas = physics.vertex_areas(measured, scene.garment.faces)
+    if scene.garment.cloth is not None:
+        rest, areas = physics.regional(rest, areas, scene.mesh, jnp.asarray(scene.garment.cloth))
     return (
         template,
         skinning.shaped_vertices(scene.body, betas),
         skinning.shaped_joints(scene.body, betas),
-        physics.rest_measures(measured, scene.mesh, flat=config.flat_hinges),
-        physics.vertex_areas(measured, scene.garment.faces),
+        rest,
+        areas,
     )
 
 

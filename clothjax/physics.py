@@ -49,6 +49,21 @@ def vertex_areas(vertices: Array, faces: Array) -> Array:
     return jnp.zeros_like(vertices[:, 0]).at[faces.reshape(-1)].add(jnp.repeat(areas / 3.0, 3))
 
 
+def regional(rest: Rest, areas: Array, mesh: Mesh, cloth: Array) -> tuple[Rest, Array]:
+    """Rest measures and areas [V] of cloth that is not the same everywhere.
+
+    The measures of an element weigh its energy, so they stand for how much of the material is there.
+
+    Args:
+        cloth: [V, 3] factors of density, of mu and lam, and of bending; elements take the mean of their corners.
+    """
+    _, stretching, bending = cloth.T
+    return rest._replace(
+        face_area=rest.face_area * jnp.mean(stretching[mesh.faces], axis=1),
+        hinge_area=rest.hinge_area / jnp.mean(bending[mesh.hinges], axis=1),  # which bending divides by
+    ), areas * cloth[:, 0]
+
+
 def green_strain(corners: Array, inverse: Array) -> Array:
     """Green strain [F, 2, 2] of posed triangles [F, 3, 3] m with inverse rest edge matrices [F, 2, 2]."""
     edges = jnp.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=-1)

@@ -12,7 +12,8 @@ Body, `format` "clothjax/body":
     optional canonical_rotation [J, 3, 3], which turns each bone of the canonical pose to a T-pose.
 Garment, `format` "clothjax/garment", attribute `body`, the name of the body it is aligned with:
     vertices [V, 3]; faces [F, 3] int32; weights_index [V, n] int16 and weights_value [V, n];
-    shapedirs [V, 3, S]; pin [V] bool, the vertices that follow skinning.
+    shapedirs [V, 3, S]; pin [V] bool, the vertices that follow skinning;
+    optional cloth [V, 3]: how many times the material's density, its mu and lam, and its bending the cloth has there.
 Motion, `format` "clothjax/motion", attribute `fps` float64:
     poses [T, J, 3], axis-angle in radians, local to the parent; zero is the body's canonical pose;
     trans [T, 3] float64, of the root relative to its canonical place; joint_names [J] strings.
@@ -43,6 +44,7 @@ UNREADABLE = (
     SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 ASSETS = Path(__file__).parent / "assets"
+FACTORS = (0.01, 100.0)  # of a region's cloth over the garment's
 
 
 # Names
@@ -127,6 +129,7 @@ def load_garment(path: str | Path, body: Body) -> Garment:
             weights=_weights(file, "V", sizes),
             shapedirs=_floats(file, "shapedirs", ("V", 3, "S"), sizes),
             pinned=_dataset(file, "pin", ("V",), sizes).astype(bool),
+            cloth=_cloth(file, sizes) if "cloth" in file else None,
         )
 
 
@@ -212,6 +215,8 @@ def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, so
         "shapedirs": np.float32(garment.shapedirs),
         "pin": np.asarray(garment.pinned, bool),
     }
+    if garment.cloth is not None:
+        data["cloth"] = np.float32(garment.cloth)
     _write(path, "garment", data, name=name, body=body, source=source, licence=licence)
 
 
@@ -328,6 +333,18 @@ def _weights(file: h5py.File, letter: str, sizes: dict[str, int]) -> np.ndarray:
     dense = np.zeros((len(index), sizes["J"]), np.float32)
     np.add.at(dense, (np.arange(len(index))[:, None], index), value)
     return dense / dense.sum(axis=1, keepdims=True)
+
+
+def _cloth(file: h5py.File, sizes: dict[str, int]) -> np.ndarray:
+    factors = _floats(file, "cloth", ("V", 3), sizes)
+    low, high = FACTORS
+    wrong = np.argwhere((factors < low) | (factors > high))
+    if len(wrong):
+        where = tuple(int(i) for i in wrong[0])
+        raise ValueError(
+            f"{file.filename}: dataset 'cloth' is {factors[where]:g} at {where}: a factor from {low} to {high}"
+        )
+    return factors
 
 
 def _sparse(weights: np.ndarray) -> dict[str, np.ndarray]:

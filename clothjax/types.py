@@ -30,6 +30,7 @@ class Garment(NamedTuple):
     weights: Array  # [V, J] skinning weights, rows sum to 1
     shapedirs: Array  # [V, 3, S] m per standard deviation
     pinned: Array  # [V] bool, vertices that follow skinning
+    cloth: Array | None = None  # [V, 3] of the material's density, mu and lam, and bending: how many times as much here
 
 
 class Motion(NamedTuple):

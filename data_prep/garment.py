@@ -279,6 +279,9 @@ class Arguments:
     """Whether it hangs, as skirts do; default: by its distance to the body."""
     flip: bool = False
     """The side that faces the body is its outside."""
+    cloth: tuple[str, ...] = ()
+    """Parts of other cloth: WHAT=DENSITY,STRETCHING,BENDING, each how many times as much as elsewhere, as
+    `object:collar=1.5,4,20` or `red=1,4,20`."""
     body: str = "body"
     """File of the body, or the name of the embedded one."""
     licence: str = "CC0-1.0"
@@ -295,7 +298,7 @@ def main(args: Arguments) -> None:
         raise ValueError("give either --template or --mesh")
     if args.vertices is not None and not FEWEST <= args.vertices <= MOST:
         raise ValueError(f"--vertices {args.vertices}: {FEWEST} to {MOST} can be trained")
-    answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed)
+    answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth)
     of_mesh = Answers(vertices=args.vertices, seed=args.seed)
     unread = [name for name in Answers._fields if getattr(answers, name) != getattr(of_mesh, name)]
     if args.mesh is None and unread:

@@ -12,6 +12,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from clothjax import animation
+from clothjax.storage import FACTORS
 from clothjax.types import Body, Garment
 from data_prep.dressing import FOREARM, WINDING, dress, highest_opening, limbs, push_out
 from data_prep.mesh import boundary_loops, compact, components, edge_table
@@ -41,6 +42,7 @@ class Answers(NamedTuple):
     loose: bool | None = None  # None: by its distance to the body
     flip: bool = False  # the side that faces the body is the outside
     seed: int = 0
+    cloth: tuple[str, ...] = ()  # WHAT=DENSITY,STRETCHING,BENDING; what, as of `pin`: red, or object:NAME
 
 
 class Mesh(NamedTuple):
@@ -63,10 +65,13 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     _check_place(path, mesh.vertices, surface, answers)
     points = UNITS[answers.units] * mesh.vertices @ TURNS[answers.up].T
     points, faces, now = _clean(path, points, mesh.faces, said)
-    marked = np.isin(np.arange(len(points)), now[_marked(path, mesh, answers.pin)])
+    marked = np.isin(np.arange(len(points)), now[_marked(path, mesh, answers.pin, "--pin")])
+    cloth = _cloth(path, mesh, answers.cloth, now, len(points), said)
     faces = _oriented(path, points, faces, surface, answers.flip, said)
     if answers.vertices:
+        before = points
         points, faces, marked = _resampled(points, faces, marked, answers.vertices, said)
+        cloth = None if cloth is None else cloth[cKDTree(before).query(points)[1]]
     if not FEWEST <= len(points) <= MOST:
         raise ValueError(
             f"{path}: {len(points)} vertices; {FEWEST} to {MOST} can be trained: give --vertices for another number"
@@ -88,7 +93,8 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
         f"{int(pinned.sum())} vertices pinned"
     )
     hidden = _bare(points, body, names)
-    return dress(points, faces, body, hidden, pinned, SAMPLES if loose else 0, answers.seed), said
+    garment = dress(points, faces, body, hidden, pinned, SAMPLES if loose else 0, answers.seed)
+    return garment._replace(cloth=cloth), said
 
 
 def read(path: str | Path) -> Mesh:
@@ -203,22 +209,52 @@ def _clean(path, points: np.ndarray, faces: np.ndarray, said: list[str]) -> tupl
     return points, faces, now[index]
 
 
-def _marked(path, mesh: Mesh, pin: str) -> np.ndarray:
-    """Vertices that the file itself says are pinned."""
-    if pin in ("none", "highest"):
+def _marked(path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
+    """Vertices [V] that the file itself marks: by a colour, or as an object."""
+    if what in ("none", "highest") and flag == "--pin":
         return np.zeros(len(mesh.vertices), bool)
-    if pin == "red":
+    if what == "red":
         if not mesh.red.any():
             raise ValueError(
-                f"{path}: --pin red, but no vertex is painted red (.ply and .glb keep colours of vertices)"
+                f"{path}: {flag} red, but no vertex is painted red (.ply and .glb keep colours of vertices)"
             )
         return mesh.red
-    if pin.startswith("object:"):
-        name = pin.removeprefix("object:")
+    if what.startswith("object:"):
+        name = what.removeprefix("object:")
         if name not in mesh.objects:
-            raise ValueError(f"{path}: has no object {name!r} to pin; there are: {', '.join(mesh.objects)}")
+            raise ValueError(f"{path}: has no object {name!r} for {flag}; there are: {', '.join(mesh.objects)}")
         return mesh.objects[name]
-    raise ValueError(f"--pin {pin}: choose none, highest, red or object:NAME")
+    known = "none, highest, red or object:NAME" if flag == "--pin" else "red=... or object:NAME=..."
+    raise ValueError(f"{flag} {what}: choose {known}")
+
+
+def _cloth(path, mesh: Mesh, regions: tuple[str, ...], now: np.ndarray, count: int, said: list[str]):
+    """Factors [V, 3] of the cloth of each vertex; None where all is the same. A later region covers an earlier one.
+
+    Args:
+        now: which of the `count` vertices each of the file's is, -1 for none.
+    """
+    if not regions:
+        return None
+    factors, (low, high) = np.ones((count, 3)), FACTORS
+    for region in regions:
+        what, _, given = region.rpartition("=")
+        try:
+            wanted = np.array([float(x) for x in given.split(",")])
+        except ValueError:
+            wanted = np.zeros(0)
+        if len(wanted) != 3 or not ((wanted >= low) & (wanted <= high)).all():
+            raise ValueError(
+                f"--cloth {region}: give WHAT=DENSITY,STRETCHING,BENDING, each how many times as much as elsewhere, "
+                f"from {low} to {high}, as red=1,4,10"
+            )
+        there = np.setdiff1d(now[_marked(path, mesh, what, "--cloth")], [-1])
+        factors[there] = wanted
+        said.append(
+            f"{what}: {len(there)} vertices with {wanted[0]:g} times the weight, {wanted[1]:g} times the stiffness, "
+            f"{wanted[2]:g} times that of bending"
+        )
+    return factors
 
 
 def _oriented(path, points, faces, surface, flip: bool, said: list[str]) -> np.ndarray:

@@ -41,7 +41,8 @@ def seeds(tmp_path_factory):
     body = _body(posed=True)
     for path in (paths["body.h5"], paths["garment.h5"].parent / "whole.body.h5"):
         storage.save_body(path, body, NAMES, name="b", **about)
-    storage.save_garment(paths["garment.h5"], _garment(body), name="g", body="b", **about)
+    garment = _garment(body)._replace(cloth=np.ones((4, 3)))
+    storage.save_garment(paths["garment.h5"], garment, name="g", body="b", **about)
     storage.save_motion(paths["motion.h5"], _spin(), NAMES, name="m", **about)
     np.savez(paths["take.npz"], **recording(frames=9))
     arrays = _smpl()

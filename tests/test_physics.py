@@ -419,6 +419,32 @@ def test_a_vertex_keeps_its_distance_from_a_triangle(x64):
     assert losses.self_collision(apart, touched, config) == 0
 
 
+def test_cloth_that_is_not_the_same_everywhere(x64):
+    """Everywhere so many times as much is another material; here and there, the sum over elements by NumPy."""
+    canonical, new, mesh = sheet()
+    step = time_step(canonical, mesh)
+
+    def energies(cloth, material=step.material):
+        rest, areas = physics.regional(step.rest, physics.vertex_areas(canonical, mesh.faces), mesh, cloth)
+        regional = step._replace(rest=rest, mass=areas * DENSITY, material=material)
+        return losses.elements(new, regional, mesh, PhysicsConfig())
+
+    as_it_is, everywhere = energies(np.ones((len(canonical), 3))), np.array([1.5, 4.0, 20.0])
+    other = step._replace(mass=1.5 * step.mass, material=Material(1.5 * DENSITY, 4 * MU, 4 * LAM, 20 * STIFFNESS))
+    found, expected = (
+        energies(np.tile(everywhere, (len(canonical), 1))), losses.elements(new, other, mesh, PhysicsConfig()),
+    )  # fmt: skip
+    for name in expected:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-12, err_msg=name)
+    cloth = np.random.default_rng(3).uniform(0.1, 10.0, (len(canonical), 3))
+    found = energies(cloth)
+    for name, corners, column in (("stretching", mesh.faces, 1), ("bending", mesh.hinges, 2)):
+        factor = np.array([np.mean([cloth[vertex, column] for vertex in element]) for element in corners])
+        np.testing.assert_allclose(found[name], factor * as_it_is[name], rtol=1e-12)
+    for name in ("gravity", "inertia"):
+        np.testing.assert_allclose(found[name], cloth[:, 0] * as_it_is[name], rtol=1e-12)
+
+
 def test_rest_measures_are_those_of_numpy(x64):
     canonical, _, mesh = sheet()
     rest = physics.rest_measures(canonical, mesh, flat=False)

@@ -154,6 +154,27 @@ def test_one_shape_for_all_is_the_shape_it_was_modelled_in(whole):
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
+def test_parts_of_other_cloth_are_worn(whole):
+    low = whole.garment.vertices[:, 1] < np.median(whole.garment.vertices[:, 1])
+    cloth = np.where(low[:, None], [3.0, 5.0, 7.0], 1.0).astype(np.float32)
+    other = _of(whole, whole.garment._replace(cloth=cloth))
+
+    def worn(scene):
+        config = whole.config
+        return jax.jit(
+            lambda b: characters.dress(scene, b, experiment.material(config), config.physics)
+        )(jnp.zeros(10))  # fmt: skip
+
+    plain, parted = worn(whole.scene), worn(other.scene)
+    mesh = whole.scene.mesh
+    inside, outside = low[mesh.faces].all(axis=1), ~low[mesh.faces].any(axis=1)
+    np.testing.assert_allclose(parted.mass, np.where(low, 3, 1) * plain.mass, rtol=1e-6)
+    np.testing.assert_allclose(parted.rest.face_area[inside], 5 * plain.rest.face_area[inside], rtol=1e-6)
+    np.testing.assert_allclose(parted.rest.face_area[outside], plain.rest.face_area[outside], rtol=1e-6)
+    bent = low[mesh.hinges].all(axis=1)
+    np.testing.assert_allclose(7 * parted.rest.hinge_area[bent], plain.rest.hinge_area[bent], rtol=1e-6)
+
+
 def _of(whole, garment):
     """The same experiment with another garment."""
     return whole._replace(garment=garment, scene=scene.build(garment, whole.body, whole.config))

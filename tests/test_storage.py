@@ -61,12 +61,20 @@ def test_body_round_trip(tmp_path, posed):
     assert [p.name for p in tmp_path.iterdir()] == ["body.h5"]  # no partial file is left
 
 
-def test_garment_round_trip(tmp_path):
+@pytest.mark.parametrize("cloth", [None, np.linspace(0.5, 20, 12, dtype=np.float32).reshape(4, 3)])
+def test_garment_round_trip(tmp_path, cloth):
     body = _body()
-    garment = _garment(body)
+    garment = _garment(body)._replace(cloth=cloth)
     storage.save_garment(tmp_path / "g.h5", garment, name="g", body="b", source="test", licence="CC0-1.0")
-    for wanted, found in zip(garment, storage.load_garment(tmp_path / "g.h5", body)):
-        np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    loaded = storage.load_garment(tmp_path / "g.h5", body)
+    assert (loaded.cloth is None) == (cloth is None)
+    for wanted, found in zip(garment, loaded):
+        if wanted is not None:
+            np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    if cloth is not None:
+        _edit(tmp_path / "g.h5", "cloth", _put((2, 1), 1e6))
+        with pytest.raises(ValueError, match=r"g\.h5: dataset 'cloth' is 1e\+06 at \(2, 1\): a factor from 0\.01"):
+            storage.load_garment(tmp_path / "g.h5", body)
 
 
 def test_motion_round_trip(tmp_path):

@@ -1,5 +1,7 @@
 """A mesh that somebody brings becomes a garment, or is refused with what to do about it."""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -119,6 +121,36 @@ def test_pins_by_colour_and_by_object(skirt, body, names, save, tmp_path):
         bring(tmp_path / "parts.glb", body, names, Answers(pin="object:hem"))
     with pytest.raises(ValueError, match="painted red"):
         bring(save(*skirt), body, names, Answers(pin="red"))
+
+
+def test_parts_of_other_cloth(skirt, body, names, save, tmp_path):
+    vertices, faces = skirt
+    low, high = vertices[:, 1].min(), vertices[:, 1].max()
+    hem, top = vertices[:, 1] < low + 0.05, vertices[:, 1] > high - 0.03
+    colours = np.where(top[:, None], [200, 10, 10, 255], [180, 180, 180, 255])
+    painted = save(vertices, faces, "painted.ply", colours)
+    assert bring(painted, body, names, Answers())[0].cloth is None
+    made, said = bring(painted, body, names, Answers(cloth=("red=1.5,4,20",)))
+    of_band = made.vertices[:, 1] > high - 0.03
+    np.testing.assert_array_equal(made.cloth[of_band], np.tile([1.5, 4, 20], (of_band.sum(), 1)))
+    np.testing.assert_array_equal(made.cloth[~of_band], np.ones(((~of_band).sum(), 3)))
+    assert any("red: " in line and "1.5 times the weight" in line for line in said)
+    scene = trimesh.Scene()
+    for name, part in (("hem", np.all(hem[faces], axis=1)), ("rest", ~np.all(hem[faces], axis=1))):
+        scene.add_geometry(trimesh.Trimesh(vertices, faces[part], process=False), geom_name=name)
+    scene.export(tmp_path / "parts.glb")
+    finer = Answers(cloth=("object:rest=1,2,2", "object:hem=3,1,1"), vertices=2000)
+    made, _ = bring(tmp_path / "parts.glb", body, names, finer)
+    of_hem = (made.cloth == [3, 1, 1]).all(axis=1)
+    assert of_hem[made.vertices[:, 1] < low + 0.03].all() and not of_hem[made.vertices[:, 1] > low + 0.07].any()
+    for wrong, said in (
+        ("red=1,4", "red=1,4: give WHAT=DENSITY"),
+        ("red=1,4,1e9", "from 0.01 to 100"),
+        ("highest=1,1,1", "--cloth highest: choose red"),
+        ("object:cuff=1,1,1", "no object 'cuff' for --cloth"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(said)):
+            bring(painted, body, names, Answers(cloth=(wrong,)))
 
 
 def test_it_is_pushed_out_of_the_body_and_remeshed(skirt, body, names, save):
