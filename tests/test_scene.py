@@ -168,7 +168,7 @@ def test_parts_of_other_cloth_are_worn(whole):
     plain, parted = worn(whole.scene), worn(other.scene)
     mesh = whole.scene.mesh
     inside, outside = low[mesh.faces].all(axis=1), ~low[mesh.faces].any(axis=1)
-    np.testing.assert_allclose(parted.mass, np.where(low, 3, 1) * plain.mass, rtol=1e-6)
+    np.testing.assert_allclose(parted.mass, np.where(low, 3, 1) * np.asarray(plain.mass), rtol=1e-6)
     np.testing.assert_allclose(parted.rest.face_area[inside], 5 * plain.rest.face_area[inside], rtol=1e-6)
     np.testing.assert_allclose(parted.rest.face_area[outside], plain.rest.face_area[outside], rtol=1e-6)
     bent = low[mesh.hinges].all(axis=1)
