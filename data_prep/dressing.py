@@ -10,7 +10,8 @@ from data_prep.retarget import cmu_names
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
 CLEARANCE = 0.004  # m, kept between garment and body
-FOREARM = ("ForeArm", "Hand", "Finger", "Thumb")
+HAND = ("Hand", "Finger", "Thumb")
+FOREARM = ("ForeArm", *HAND)
 ARM = ("LeftArm", "RightArm", *FOREARM)
 ON_SKIN = 1e-7  # m
 

@@ -25,6 +25,7 @@ from clothjax.types import Body, Garment
 from data_prep.dressing import (
     ARM,
     FOREARM,
+    HAND,
     WINDING,
     clear_vertices,
     dress,
@@ -52,7 +53,7 @@ class Template:
     blur: float = 1.2  # grid cells
     hull: tuple[str, float, float] | None = None  # what hangs: from where, how far above, flare in m per m
     only_hull: bool = False
-    sleeve: float | None = None  # share of the upper arm
+    sleeve: float | None = None  # share of the upper arm; from 1 on, of the forearm too
     neck: float | None = None  # m the neckline is lowered
     scoop: float | None = None  # m, depth of a neckline with bare shoulders
     waist: bool = False  # ends at the waist and is pinned there
@@ -61,7 +62,7 @@ class Template:
 
 TEMPLATES = {
     "tshirt": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=0.55, neck=0.015),
-    "longsleeve": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=1.75, neck=0.015),
+    "longsleeve": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=1.8, neck=0.015),
     "tank": Template(("crotch", 0.02), 4, scoop=0.10),
     "pants": Template(("ankle", 0.06), 3, closing=0.02, blur=1.0, waist=True),
     "skirt": Template(
@@ -130,7 +131,8 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
             f"template {template!r} came out with {len(boundary_loops(faces))} openings, not {kind.loops}, "
             "on this body: try another pose, or bring a mesh (--mesh)"
         )
-    hidden = limbs(body, names, ARM if kind.waist else FOREARM)
+    long = kind.sleeve is not None and kind.sleeve > 1
+    hidden = limbs(body, names, ARM if kind.waist else HAND if long else FOREARM)
     pinned = highest_opening(shape, faces) if kind.waist else np.zeros(len(shape), bool)
     return dress(shape, faces, body, hidden, pinned, kind.samples, seed)
 
@@ -151,7 +153,7 @@ def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
     known = cmu_names(names)
     joint = {name: np.asarray(place, np.float64) for name, place in zip(known, body.joints)}
     needed = {"Neck", "Hips", "LowerBack"} | {
-        side + bone for side in ("Left", "Right") for bone in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")
+        side + bone for side in ("Left", "Right") for bone in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
     }
     if needed - set(joint):
         raise ValueError(f"the body lacks the joints {sorted(needed - set(joint))}: name them as CMU or SMPL do")
@@ -173,7 +175,8 @@ def _solid(kind: Template, wearer: Wearer) -> tuple[np.ndarray, np.ndarray]:
     """Closed surface of the implicit garment, before it is cut."""
     hem = wearer.level[kind.hem[0]] + kind.hem[1]
     top = wearer.level["waist"] + 0.02 if kind.waist else wearer.joint["Neck"][1] + 0.12
-    reach = max(abs(wearer.joint[f"{side}ForeArm"][0]) for side in ("Left", "Right")) + 0.05
+    end = "Hand" if kind.sleeve is not None and kind.sleeve > 1 else "ForeArm"
+    reach = max(abs(wearer.joint[f"{side}{end}"][0]) for side in ("Left", "Right")) + 0.05
     width = max(0.45 if kind.hull else 0.4, 0 if kind.waist else reach)
     deep = 0.27 if kind.hull else 0.12
     low = np.array([-width, hem - 0.05, wearer.vertices[:, 2].min() - deep])
@@ -235,9 +238,10 @@ def _cuts(kind: Template, wearer: Wearer) -> list[Callable[[np.ndarray], np.ndar
         cuts.append(lambda x: x[:, 1] - waist)
     if kind.sleeve is not None:
         for side in ("Left", "Right"):
-            shoulder, along = joint[f"{side}Arm"], joint[f"{side}ForeArm"] - joint[f"{side}Arm"]
-            end, along = shoulder + kind.sleeve * along, along / np.linalg.norm(along)
-            cuts.append(_beyond_plane(end, along, within=0.16))
+            upper, fore, hand = (joint[side + bone] for bone in ("Arm", "ForeArm", "Hand"))
+            start, along = (upper, fore - upper) if kind.sleeve <= 1 else (fore, hand - fore)
+            share = kind.sleeve if kind.sleeve <= 1 else kind.sleeve - 1
+            cuts.append(_beyond_plane(start + share * along, along / np.linalg.norm(along), within=0.16))
     if kind.neck is not None:
         base, up = neck + np.array([0, 0.02 - kind.neck, 0]), np.array([0, 1, 0.35]) / np.hypot(1, 0.35)
         radius = 0.42 * broad

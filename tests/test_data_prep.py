@@ -475,6 +475,19 @@ def test_skirt_template(tmp_path, body, names):
     assert skirt.weights[:, arms].max() < 0.05
 
 
+def test_long_sleeves_go_along_the_forearms(body, names):
+    shirt = garment.build("longsleeve", 400, body, names)
+    for side in ("Left", "Right"):
+        fore, hand = (np.asarray(body.joints[names.index(side + bone)]) for bone in ("ForeArm", "Hand"))
+        along = (shirt.vertices - fore) @ (hand - fore) / np.sum((hand - fore) ** 2)
+        beside = np.linalg.norm(shirt.vertices - fore - along[:, None] * (hand - fore), axis=1) < 0.1
+        assert along[beside].max() == pytest.approx(0.8, abs=0.05)
+        of_arm = shirt.weights[:, [i for i, n in enumerate(names) if n.startswith(side) and "Arm" in n]].sum(axis=1)
+        of_forearm = shirt.weights[:, names.index(f"{side}ForeArm")]
+        cuff = beside & (along > 0.5)
+        assert cuff.sum() > 5 and of_forearm[cuff].min() > 0.8 and of_arm[cuff].min() > 0.9
+
+
 def test_garment_from_a_mesh(tmp_path, body):
     shirt = storage.load_garment("tshirt_1000", body)
     trimesh.Trimesh(shirt.vertices, shirt.faces, process=False).export(tmp_path / "shirt.obj")
