@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+# what joints from the wrists on are called, in lower case, by CMU and by SMPL
+HANDS = ("hand", "finger", "thumb", "wrist", "index", "middle", "pinky", "ring")
+
 
 def _require(condition: bool, message: str) -> None:
     if not condition:
@@ -339,8 +342,8 @@ class Stage2Config:
     """Teacher rollouts, each of its own betas and material ..."""
     frames: int = 160
     """... and this many frames."""
-    excluded_joints: tuple[str, ...] = ("Hand", "Finger", "Thumb", "Toe")
-    """Joints whose names contain one of these are not inputs."""
+    excluded_joints: tuple[str, ...] = (*HANDS, "toe", "jaw", "eye")
+    """Joints whose names contain one of these, in upper or lower case, are not inputs."""
     seed: int = 0
 
 

@@ -12,6 +12,8 @@ from clothjax.config import Config
 from clothjax.scene import Scene
 from clothjax.types import Body, Garment, Material, Motion
 
+MEASURABLE = 12  # frames of a motion, at least, for all that is measured of it
+
 
 class Experiment(NamedTuple):
     """What a configuration names, loaded."""
@@ -76,6 +78,22 @@ def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
     return reel, {name: len(wrong) for name, wrong in zip(names, bad)}
 
 
+def evaluation_motion(experiment: Experiment, name: str | Path) -> Motion:
+    """A motion to measure on, with no more than `evaluation.frames` frames.
+
+    Raises:
+        ValueError: as `motion`, and for fewer frames than can be measured.
+    """
+    clip, most = motion(experiment, name), experiment.config.evaluation.frames
+    clip = Motion(clip.rotations[:most], clip.translation[:most], clip.fps)
+    if len(clip.translation) < MEASURABLE:
+        raise ValueError(
+            f"{name}: {len(clip.translation)} frames to measure on (`evaluation.frames` is {most}); at least "
+            f"{MEASURABLE} are needed"
+        )
+    return clip
+
+
 def windows(clip: Motion) -> Clips:
     """One clip on a reel of its own, every frame of it usable."""
     return clips.concatenate([clip], [""], [np.zeros(0, int)], 1)
@@ -108,7 +126,7 @@ def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
         return np.linalg.det(corners).sum() / 6
 
     growth = np.array([volume(unit) - volume(-unit) for unit in np.eye(count)])
-    heavy = experiment.config.evaluation.betas * growth / np.linalg.norm(growth)
+    heavy = experiment.config.evaluation.betas * growth / max(np.linalg.norm(growth), 1e-12)
     bodies = {"thin": -heavy, "mean": 0 * heavy, "heavy": heavy}
     ranges = (cloth.mu_range, cloth.lam_range, cloth.bending_range)
     middle = [np.sqrt(r.low * r.high) if r.log else 0.5 * (r.low + r.high) for r in ranges]

@@ -137,8 +137,14 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     A vertex of it is displaced as the place of the model's own mesh that it is nearest to.
 
     Args:
+        model: as it was loaded; what comes of it can be specialised.
         betas: [S] of the model's wearer.
+
+    Raises:
+        ValueError: for a model that was specialised: the mesh may need what that has left out.
     """
+    if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
+        raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))
     own, faces = np.asarray(model.wearer.template).T, np.asarray(model.faces)
     groups = proximity.patches(own, faces).groups

@@ -193,7 +193,20 @@ def crowd(models: Sequence[Model]) -> Model:
 
     Args:
         models: of different wearers, otherwise the same.
+
+    Raises:
+        ValueError: if there is none, or one differs from the first in more than its wearer.
     """
+    if not models:
+        raise ValueError("a crowd needs at least one model")
+    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=None)) for model in models)
+    for number, (leaves, structure) in enumerate(others, 1):
+        same = structure == first[1] and all(a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0]))
+        if not same:
+            raise ValueError(
+                f"models[{number}] differs from models[0] in more than its wearer: a crowd is of one garment, and of "
+                "models whose blend shapes `specialise` has not fitted to their wearers"
+            )
     wearers = jax.tree.map(lambda *each: jnp.stack(each), *(model.wearer for model in models))
     return dataclasses.replace(models[0], wearer=wearers)
 
@@ -331,12 +344,26 @@ def _axes(model: Model) -> Model:
     return dataclasses.replace(model, network=None, faces=None, wearer=0)
 
 
-@jax.jit
 def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
     """A whole motion: vertices [T, V, 3] m in the world, and `ok` [T], as in `State`, of each frame.
 
     The first frame is the garment settled on the standing first pose.
+
+    Raises:
+        ValueError: for a motion of another number of joints, or frames a second, than the model's.
     """
+    if motion.rotations.shape[1] != len(model.names):
+        raise ValueError(f"the motion has {motion.rotations.shape[1]} joints, the garment's body {len(model.names)}")
+    if abs(motion.fps - model.config.fps) > 1e-3:
+        raise ValueError(
+            f"the motion has {motion.fps:g} frames a second, the garment was trained for {model.config.fps:g}: "
+            "resample the motion"
+        )
+    return _animate(model, motion)
+
+
+@jax.jit
+def _animate(model: Model, motion: Motion) -> tuple[Array, Array]:
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
     first = jax.tree.map(lambda x: x[0], poses)
 

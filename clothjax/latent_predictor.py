@@ -34,7 +34,8 @@ class Normalizers(NamedTuple):
 
 def kept_joints(names: tuple[str, ...], config: Stage2Config) -> np.ndarray:
     """Indices of the joints that are inputs: all but hands, fingers and toes, which move no garment."""
-    kept = [i for i, name in enumerate(names) if not any(word in name for word in config.excluded_joints)]
+    excluded = [word.lower() for word in config.excluded_joints]
+    kept = [i for i, name in enumerate(names) if not any(word in name.lower() for word in excluded)]
     return np.array(kept, np.int32)
 
 

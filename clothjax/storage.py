@@ -123,6 +123,9 @@ def load_garment(path: str | Path, body: Body) -> Garment:
             )
         faces = _faces(file, ("F", 3), sizes, sizes["V"])
         _check_sides(file, faces)
+        loose = np.setdiff1d(np.arange(sizes["V"]), faces)
+        if len(loose):
+            raise ValueError(f"{file.filename}: vertex {loose[0]} has no face ({len(loose)} such): remove it")
         return Garment(
             vertices=vertices,
             faces=faces,

@@ -4,6 +4,7 @@ A packed model is a folder with `model.npz` and `config.yaml`. Large matrices ar
 each column (`NAME` and `NAME|scale`), the blend shapes and the preconditioner in half precision, all else as it is.
 """
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +153,15 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         arrays[name] = leaf
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(out / WEIGHTS, **arrays)
-    (out / CONFIG).write_text(yaml.safe_dump(configuration.to_dict(config), sort_keys=False))
+    partial = {name: out / f".{os.getpid()}.{name}" for name in (WEIGHTS, CONFIG)}
+    try:
+        np.savez_compressed(partial[WEIGHTS], **arrays)
+        partial[CONFIG].write_text(yaml.safe_dump(configuration.to_dict(config), sort_keys=False))
+        for name, path in partial.items():
+            os.replace(path, out / name)
+    finally:
+        for path in partial.values():
+            path.unlink(missing_ok=True)
     return (out / WEIGHTS).stat().st_size
 
 

@@ -3,6 +3,7 @@
 import igl
 import numpy as np
 
+from clothjax.config import HANDS
 from clothjax.types import Body, Garment
 from data_prep.diffusion import diffuse
 from data_prep.mesh import boundary_loops
@@ -10,9 +11,8 @@ from data_prep.retarget import cmu_names
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
 CLEARANCE = 0.004  # m, kept between garment and body
-HAND = ("Hand", "Finger", "Thumb")
-FOREARM = ("ForeArm", *HAND)
-ARM = ("LeftArm", "RightArm", *FOREARM)
+FOREARM = ("forearm", *HANDS)
+ARM = ("leftarm", "rightarm", *FOREARM)
 ON_SKIN = 1e-7  # m
 
 
@@ -58,8 +58,9 @@ def outward(points: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> tupl
 
 
 def limbs(body: Body, names: tuple[str, ...], parts: tuple[str, ...], share: float = 0.3) -> np.ndarray:
-    """Whether each vertex of the body [B] follows, by more than a share, joints whose names contain one of `parts`."""
-    followed = [any(part in name for part in parts) for name in cmu_names(names)]
+    """Whether each vertex of the body [B] follows, by more than a share, joints whose names, in CMU's
+    way and lower case, contain one of `parts`."""
+    followed = [any(part in name.lower() for part in parts) for name in cmu_names(names)]
     return np.asarray(body.weights)[:, followed].sum(axis=1) > share
 
 

@@ -20,12 +20,12 @@ import tyro
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import ConvexHull
 
+from clothjax.config import HANDS
 from clothjax.storage import joint_names, load_body, save_garment
 from clothjax.types import Body, Garment
 from data_prep.dressing import (
     ARM,
     FOREARM,
-    HAND,
     WINDING,
     clear_vertices,
     dress,
@@ -132,7 +132,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
             "on this body: try another pose, or bring a mesh (--mesh)"
         )
     long = kind.sleeve is not None and kind.sleeve > 1
-    hidden = limbs(body, names, ARM if kind.waist else HAND if long else FOREARM)
+    hidden = limbs(body, names, ARM if kind.waist else HANDS if long else FOREARM)
     pinned = highest_opening(shape, faces) if kind.waist else np.zeros(len(shape), bool)
     return dress(shape, faces, body, hidden, pinned, kind.samples, seed)
 

@@ -72,7 +72,7 @@ def main(argv: list[str]) -> None:
     before = earlier(arguments.compare) if arguments.compare else None
     path, plot = arguments.json, arguments.plot or arguments.json.with_suffix(".png")
     if arguments.part is None:
-        report = each_part(arguments.runs, arguments.quick, plot)
+        report = each_part(arguments.runs, arguments.quick, path, plot)
     else:
         report = measure(arguments.part, arguments.runs, arguments.quick)
         drawn = plot.with_suffix(f".{arguments.part}{plot.suffix}")
@@ -91,9 +91,14 @@ def main(argv: list[str]) -> None:
     print(f"written to {path}")
 
 
-def each_part(runs: list[str], quick: bool, plot: Path) -> dict:
-    """All parts, each in a process of its own: they differ in how many cores jax may use."""
+def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
+    """All parts, each in a process of its own: they differ in how many cores jax may use.
+
+    Args:
+        kept: where the report so far is written after each part, should the next one fail.
+    """
     report = {}
+    kept.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for part in PARTS:
             path = Path(folder) / f"{part}.json"
@@ -101,8 +106,12 @@ def each_part(runs: list[str], quick: bool, plot: Path) -> dict:
             command += ["--part", part, "--json", str(path), "--plot", str(plot), *(["--quick"] if quick else [])]
             print(f"part {part}", flush=True)
             if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
-                raise ValueError(f"the part {part} failed, as said above: run it alone with --part {part}")
+                raise ValueError(
+                    f"the part {part} failed, as said above: run it alone with --part {part}; what was measured before "
+                    f"it is in {kept}"
+                )
             report |= json.loads(path.read_text())
+            kept.write_text(json.dumps(report, indent=1) + "\n")
     return report
 
 

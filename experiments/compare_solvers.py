@@ -181,6 +181,7 @@ def main(argv: list[str]) -> None:
     report, tracks = compare(arguments.scenes, arguments.substeps, arguments.frames, arguments.iterations)
     print(table(report))
     if arguments.json:
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     if arguments.png:
         draw(arguments.png, tracks)

@@ -70,6 +70,9 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     if (arguments.run is None) == (arguments.pretrained is None):
         raise ValueError("give the folder of a run, or --pretrained with names of garments or `all`")
+    path = arguments.json or (arguments.run or Path(".")) / "evaluation.json"
+    if arguments.json is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
     if arguments.pretrained is None:
         report = evaluate(arguments.run, arguments.motion)
         print(table(report["evaluation"]))
@@ -77,7 +80,6 @@ def main(argv: list[str]) -> None:
         names = trained.shipped() if arguments.pretrained == ["all"] else tuple(arguments.pretrained)
         report = pretrained({name: trained.folder(name) for name in names}, arguments.motion)
         print(table(report["mean"]))
-    path = arguments.json or (arguments.run or Path(".")) / "evaluation.json"
     path.write_text(json.dumps(report, indent=1) + "\n")
     print(f"written to {path}")
 
@@ -125,10 +127,7 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     each, wearers = {}, {}
     with progress("evaluating", 4 * len(names) + 1) as report:
         for index, name in enumerate(names):
-            clip = experiment.motion(whole, name)
-            clip = Motion(
-                clip.rotations[: config.evaluation.frames], clip.translation[: config.evaluation.frames], clip.fps
-            )
+            clip = experiment.evaluation_motion(whole, name)
             done = partial(lambda base, n: report(base + n), 4 * index)
             path = kept(run) / f"trajectories_{Path(name).stem}.npz"
             each[Path(name).stem] = _motion(whole, stages, garment, character, betas, clip, done, path)

@@ -39,6 +39,7 @@ def main(argv: list[str]) -> None:
     if (arguments.run is None) == (arguments.pretrained is None):
         raise ValueError("give the folder of a run, or --pretrained with the name of a garment")
     run = arguments.run or trained.folder(arguments.pretrained)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     rows, columns = pictures(run, arguments.motions, arguments.frame)
     animation.comparison(arguments.out, rows, columns)
     print(f"written to {arguments.out}")

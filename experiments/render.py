@@ -48,6 +48,7 @@ def main(argv: list[str]) -> None:
     if (arguments.run is None) == (arguments.pretrained is None):
         raise ValueError("give the folder of a run, or --pretrained with the name of a garment")
     run = arguments.run or trained.folder(arguments.pretrained)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     whole, _ = load_phi(run)
     motion = arguments.motion or whole.config.evaluation.motions[0]
     frames = arguments.frames or whole.config.evaluation.animation_frames

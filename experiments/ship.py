@@ -8,6 +8,7 @@ the validation motions, with the command that trained it and its hours.
 
 import argparse
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -22,11 +23,11 @@ def main(argv: list[str]) -> None:
     parser.add_argument("run", type=Path, help="folder of a finished run")
     parser.add_argument("name", help="of the garment")
     arguments = parser.parse_args(argv)
-    folder = trained.MODELS / arguments.name
-    size = trained.pack(arguments.run, folder)
-    print(f"{folder}: {size / 1e6:.2f} MB of weights")
-    report = pretrained({arguments.name: folder})[arguments.name]
-    config, _ = trained.phi(folder)
+    folder, packed = trained.MODELS / arguments.name, arguments.run / "packed" / arguments.name
+    size = trained.pack(arguments.run, packed)
+    print(f"{packed}: {size / 1e6:.2f} MB of weights")
+    report = pretrained({arguments.name: packed})[arguments.name]
+    config, _ = trained.phi(packed)
     seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
     seconds += sum(add_seconds(arguments.run).values())
     about = {
@@ -35,8 +36,11 @@ def main(argv: list[str]) -> None:
         "seed": config.stage1.seed,
         "hours": seconds / 3600,
     }
-    (folder / "report.json").write_text(json.dumps(about | report, indent=1) + "\n")
-    print(table(report))
+    (packed / "report.json").write_text(json.dumps(about | report, indent=1) + "\n")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in packed.iterdir():
+        shutil.copy(path, folder)
+    print(f"{table(report)}\nin {folder}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import submitit
 
-from clothjax import checkpoint, configuration
+from clothjax import configuration, trained
 from clothjax.config import Config
 from experiments import evaluate, train
 from experiments.session import fail_clearly, progress, setup
@@ -35,8 +35,7 @@ class Job(submitit.helpers.Checkpointable):
         run = Path(directory)
         report = run / "evaluation.json"
         if report.exists():
-            kept = checkpoint.latest(run / "stage2" / "checkpoints").config
-            if kept != json.loads(json.dumps(configuration.to_dict(_configured(arguments, directory)))):
+            if trained.network(run)[0] != _configured(arguments, directory):
                 raise ValueError(f"{run} was trained with other settings: give another --directory, or remove it")
         else:
             train.main([*arguments, "--directory", directory])
@@ -139,10 +138,11 @@ def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
 
 
 def table(summary: dict[str, dict]) -> str:
-    """The figures of every job's Psi, as Markdown."""
+    """The figures of every job's Psi, or of its peer's network, as Markdown."""
     rows = ["| | " + " | ".join(COLUMNS) + " |", "|---" * (1 + len(COLUMNS)) + "|"]
     for name, stages in summary.items():
-        cells = (f"{stages['psi'][column]:.4g}" if column in stages["psi"] else "" for column in COLUMNS)
+        last = list(stages.values())[-1]
+        cells = (f"{last[column]:.4g}" if column in last else "" for column in COLUMNS)
         rows.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(rows)
 

@@ -86,7 +86,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     whole = experiment.assemble(config)
     reel, bad = experiment.training_clips(whole)
     for name in config.evaluation.motions:
-        experiment.motion(whole, name)  # a wrong one shows now, not after hours
+        experiment.evaluation_motion(whole, name)  # a wrong one shows now, not after hours
     for name, count in bad.items():
         if count:
             devices.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
@@ -258,6 +258,8 @@ def refine(
         inverse = stage1.rest_inverse_hessian(garment, whole.scene, config)
     frozen = jax.device_get(refinement.Frozen(garment, normalizers, inverse))
     folder = directory / "refinement"
+    if jax.process_index() == 0 and not checkpoint.steps(folder / "checkpoints"):
+        shutil.rmtree(folder / refinement.ROUNDS, ignore_errors=True)  # played by a training that came to nothing
     update = refinement.make_update(whole.scene, reel, kept, frozen, config, folder, STEPS_PER_CALL, device_mesh)
     fitted = fit.fit(
         update,

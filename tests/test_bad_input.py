@@ -105,6 +105,11 @@ def a_misspelt_setting(folder):
     return training(folder, stage1={"learning_rat": 1e-3})
 
 
+@case("walk_3", "8 frames to measure on", "at least 12")
+def too_few_frames_to_measure(folder):
+    return training(folder, "--evaluation.frames", "8")
+
+
 @case("learning_rat")
 def a_misspelt_flag(folder):
     return training(folder, "--stage1.learning_rat", "1")

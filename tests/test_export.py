@@ -56,6 +56,16 @@ def test_onnx_of_a_folded_code_and_of_a_relu(motion, tmp_path):
     assert model.config.model.blendshape_relu and small().model.decoder_skip
 
 
+def test_onnx_of_a_model_that_sees_the_root_alone(motion, tmp_path):
+    from test_folding import random_model
+
+    others = ("joint", "leg", "foot", "back", "spine", "shoulder", "arm", "neck", "head")
+    model = random_model(True, others)
+    assert [model.names[i] for i in model.kept] == ["Hips"]
+    path = onnx.to_onnx(model, tmp_path / "g.onnx")
+    assert apart(onnx.run_onnx(path, model, motion), model, motion).max() < 2e-5
+
+
 def test_onnx_takes_wild_input_as_the_model_does(model, motion, tmp_path):
     run = session(onnx.to_onnx(model, tmp_path / "g.onnx"))
     rotations, translation = np.array(motion.rotations[:12]), np.array(motion.translation[:12])

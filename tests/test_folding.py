@@ -31,13 +31,19 @@ def wide():
     return random_model(skip=False)
 
 
-def random_model(skip):
-    """A random model with a wide code, and either a skip or a ReLU on the weights."""
+def random_model(skip, excluded=()):
+    """A random model with a wide code, and either a skip or a ReLU on the weights, that does not see the joints whose
+    names have `excluded` in them."""
     config = small()
     config = dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, decoder=(24,), decoder_skip=skip, blendshape_relu=not skip),
         stage2=dataclasses.replace(config.stage2, hidden=(32, 32), latent_decay=0.3),
+    )
+    unseen = config.stage2.excluded_joints + tuple(excluded)
+    config = dataclasses.replace(
+        config,
+        stage2=dataclasses.replace(config.stage2, excluded_joints=unseen),
     )
     whole = experiment.assemble(config)
     rng = np.random.default_rng(0)
@@ -161,6 +167,9 @@ def test_a_finer_mesh_moves_with_the_model_and_its_own_mesh_not_at_all(motion):
     same = folding.on_mesh(model, storage.load_garment("tshirt_1000", body), betas)
     np.testing.assert_allclose(inference.animate(same, clip)[0], inference.animate(model, clip)[0], atol=2e-5)
     garment = storage.load_garment("tshirt_4000", body)
+    for specialised in (folding.specialise(model), folding.specialise(model, blendshapes=96)):
+        with pytest.raises(ValueError, match="specialised already: put it on the other mesh first"):
+            folding.on_mesh(specialised, garment, betas)
     fine = np.asarray(inference.animate(folding.on_mesh(model, garment, betas), clip)[0])
     assert fine.shape[1] == len(garment.vertices)
     # it lies on the coarse one: as near to its vertices as at rest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import experiment, inference, latent_predictor, stage1, stage2, storage
+from clothjax import experiment, folding, inference, latent_predictor, stage1, stage2, storage
 from clothjax.types import Material, Motion, Pose
 
 
@@ -73,6 +73,27 @@ def test_a_crowd_is_each_of_its_characters(trained):
         state, vertices = inference.step(model, *jax.tree.map(lambda x, i=i: x[i], (states, pose)))
         np.testing.assert_allclose(together[i], vertices, atol=1e-5)
         np.testing.assert_allclose(following.latent[i], state.latent, atol=1e-5)
+
+
+def test_a_crowd_is_of_one_garment(trained):
+    model, _, _, wearer = trained
+    other = wearer(np.ones(10))
+    changed = other.network._replace(shapes=2 * other.network.shapes)
+    with pytest.raises(ValueError, match=r"models\[1\] differs from models\[0\] in more than its wearer"):
+        inference.crowd([model, dataclasses.replace(other, network=changed)])
+    fewer = [folding.specialise(each, blendshapes=4) for each in (model, other)]
+    with pytest.raises(ValueError, match="whose blend shapes `specialise` has not fitted"):
+        inference.crowd(fewer)
+    with pytest.raises(ValueError, match="at least one"):
+        inference.crowd([])
+
+
+def test_a_motion_of_another_rate_or_skeleton_is_refused(trained):
+    model, motion, *_ = trained
+    with pytest.raises(ValueError, match="60 frames a second, the garment was trained for 30"):
+        inference.animate(model, motion._replace(fps=60.0))
+    with pytest.raises(ValueError, match="has 24 joints, the garment's body 31"):
+        inference.animate(model, motion._replace(rotations=motion.rotations[:, :24]))
 
 
 def test_a_garment_that_nobody_sees_goes_on(trained):

@@ -10,16 +10,17 @@ from clothjax import clips, experiment, garment_model, latent_predictor, skinnin
 from clothjax.config import Config, MaterialConfig
 from clothjax.stage2 import Teacher
 from clothjax.types import Material
+from data_prep.smpl import NAMES
 
 
-def test_smpl_gives_the_input_count_of_the_thesis():
-    names = (*tuple(f"joint{i}" for i in range(20)), "LeftHand", "RightHand", "LThumb", "RThumb")
-    kept = latent_predictor.kept_joints(names, Config().stage2)
-    rotations = jnp.broadcast_to(jnp.eye(3), (3, 24, 3, 3))
-    inputs = latent_predictor.pose_inputs(rotations, jnp.zeros((3, 24, 3)), jnp.zeros((2, 3)), kept, 30.0)
+@pytest.mark.parametrize("count", [24, 52, 55])
+def test_smpl_gives_the_input_count_of_the_thesis(count):
+    kept = latent_predictor.kept_joints(NAMES[count], Config().stage2)
+    rotations = jnp.broadcast_to(jnp.eye(3), (3, count, 3, 3))
+    inputs = latent_predictor.pose_inputs(rotations, jnp.zeros((3, count, 3)), jnp.zeros((2, 3)), kept, 30.0)
     material = Material(*(jnp.float32(x) for x in (0.2, 2e4, 4e4, 1e-5)))
     constants = latent_predictor.constant_inputs(jnp.zeros(10), material, MaterialConfig())
-    assert len(kept) == 20
+    np.testing.assert_array_equal(kept, np.arange(20))
     assert inputs.size + constants.size == 551
     assert inputs.size + constants.size + 2040 == 2591
 

@@ -61,6 +61,14 @@ def test_body_round_trip(tmp_path, posed):
     assert [p.name for p in tmp_path.iterdir()] == ["body.h5"]  # no partial file is left
 
 
+def test_a_vertex_without_a_face_is_refused(tmp_path):
+    body = _body()
+    garment = _garment(body)._replace(faces=np.array([[0, 1, 2]], np.int32))
+    storage.save_garment(tmp_path / "g.h5", garment, name="g", body="b", source="test", licence="CC0-1.0")
+    with pytest.raises(ValueError, match=r"g\.h5: vertex 3 has no face"):
+        storage.load_garment(tmp_path / "g.h5", body)
+
+
 @pytest.mark.parametrize("cloth", [None, np.linspace(0.5, 20, 12, dtype=np.float32).reshape(4, 3)])
 def test_garment_round_trip(tmp_path, cloth):
     body = _body()

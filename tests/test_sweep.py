@@ -29,7 +29,7 @@ def test_a_job_for_every_garment_and_seed(config, tmp_path, monkeypatch, capsys)
             seed = int(arguments[arguments.index("--stage1.seed") + 1])
             if seed == 2:
                 raise ValueError("the wind was too strong")
-            return {"psi": {"energy_gap": 0.5 + seed}, "told": [*arguments, directory]}
+            return {"told": [*arguments, directory], "psi": {"energy_gap": 0.5 + seed}}
 
     monkeypatch.setattr(sweep, "Job", Told)
     folder = tmp_path / "sweep"
@@ -81,6 +81,11 @@ def test_a_job_on_this_machine_has_the_gpu_it_is_given(tmp_path):
 def test_two_jobs_of_one_name_are_refused(config, tmp_path):
     with pytest.raises(ValueError, match="two jobs would be called skirt_1000_1"):
         sweep.main([str(config), "--garments", "skirt_1000", "--seeds", "1", "1", "--directory", str(tmp_path / "s")])
+
+
+def test_the_table_is_of_the_last_stage_or_the_peers_network():
+    figures = {"lbs": {"energy_gap": 1.0}, "ncs": {"energy_gap": 0.25, "jitter": 0.5}}
+    assert sweep.table({"a": figures}).splitlines()[-1] == "| a | 0.25 |  |  | 0.5 |  |"
 
 
 @pytest.mark.slow

@@ -164,7 +164,7 @@ def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tu
         frames: [N, 3, 12 J + 3] rows of the history, the new one first.
         last: the row of the frame before, or its beginning.
     """
-    count, root, others = len(model.parents), model.kept[0], np.array(model.kept[1:])
+    count, root, others = len(model.parents), model.kept[0], np.array(model.kept[1:], np.int64)
     seen = len(others)
     # cosine and sine of the heading, times something: r00 + r22 and r02 - r20
     pick = np.zeros((9, 2), np.float32)
@@ -181,17 +181,20 @@ def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tu
     steps = g("MatMul", difference, g.slice(frames, 2, 9 * count, 9 * count + 3))
     of_columns = np.array([0, 3, 6, 1, 4, 7])  # of a matrix, row by row
     columns = g.reshape(g("Gather", frames, 9 * root + of_columns, axis=2), 6, 3)
-    places = (9 * count + 3 + 3 * others[:, None] + np.arange(3)).reshape(-1)
-    relative = g("Sub", g("Gather", frames, places, axis=2), np.tile(origin, seen))
-    vectors = g("Concat", steps, columns, g.reshape(relative, 3 * seen, 3), axis=1)
-    turned = g.reshape(g("MatMul", vectors, heading), 3 * (2 + 6 + 3 * seen))
-    codes = g.reshape(g("Gather", frames, (9 * others[:, None] + of_columns).reshape(-1), axis=2), 18 * seen)
+    vectors, codes = [steps, columns], []
+    if seen:
+        places = (9 * count + 3 + 3 * others[:, None] + np.arange(3)).reshape(-1)
+        relative = g("Sub", g("Gather", frames, places, axis=2), np.tile(origin, seen))
+        vectors.append(g.reshape(relative, 3 * seen, 3))
+        of_others = (9 * others[:, None] + of_columns).reshape(-1)
+        codes.append(g.reshape(g("Gather", frames, of_others, axis=2), 18 * seen))
+    turned = g.reshape(g("MatMul", g("Concat", *vectors, axis=1), heading), 3 * (2 + 6 + 3 * seen))
 
     place = np.arange(6 + 18 * (seen + 1) + 9 * seen)
     velocity, rows, apart = np.split(place, [6, 6 + 18 * (seen + 1)])
     rows = rows.reshape(3, seen + 1, 6)  # frames, joints, two columns
     order = [velocity, rows[:, 0].reshape(-1), apart, rows[:, 1:].reshape(-1)]
-    return g("Concat", turned, codes, axis=1), np.concatenate(order)
+    return g("Concat", turned, *codes, axis=1), np.concatenate(order)
 
 
 def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:

@@ -143,7 +143,8 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
             calls[f"jax: {name}"] = jax_call(form)
             found[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), "jax")
     folded = forms["folded"]
-    fine = folding.on_mesh(folded, storage.load_garment(FINE, storage.load_body(config.body)), betas)
+    fine = folding.on_mesh(model, storage.load_garment(FINE, storage.load_body(config.body)), betas)
+    fine = folding.specialise(fine)
     for int8 in (False, True):
         kind = ", int8" if int8 else ""
         for output in ("canonical", "none"):
