@@ -32,8 +32,11 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
             the wrong type and whatever `__post_init__` refuses, naming the file and the dotted path.
         SystemExit: for a mistake in `overrides`, after printing what is wrong with them, or for `--help`.
     """
-    values, sources = _read(Path(path), ())
-    config = _build(cls, values, "", sources, str(path))
+    try:
+        values, sources = _read(Path(path), ())
+        config = _build(cls, values, "", sources, str(path))
+    except RecursionError:
+        raise ValueError(f"{path}: a value contains itself (an anchor, `&name`, around its own `*name`)") from None
     return _override(cls, config, overrides, prog=f"... {path}") if overrides else config
 
 

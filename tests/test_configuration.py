@@ -129,6 +129,8 @@ def test_extends_merges_mappings_and_replaces_lists(tmp_path):
         ("extends: missing.yaml", ["missing.yaml", "cannot be read", "c.yaml"]),
         ("extends: [a, b]", ["extends", "one file"]),
         ("extends: c.yaml", ["circle"]),
+        ("hidden: &all [*all]", ["a value contains itself"]),
+        ("train: &all {steps: *all}", ["a value contains itself"]),
     ],
 )
 def test_mistakes_name_the_file_and_the_place(tmp_path, text, parts):
