@@ -244,6 +244,8 @@ def make_update(
 
     def update(state: TrainingState):
         nonlocal now
+        if int(state.step) == 0:
+            begun.clear()  # what an earlier training, that came to nothing, may have played of other motions
         number = turns[int(state.step) // steps]
         if now is None or now[0] != number:
             now = (number, *data(number, state.average))

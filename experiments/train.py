@@ -258,8 +258,6 @@ def refine(
         inverse = stage1.rest_inverse_hessian(garment, whole.scene, config)
     frozen = jax.device_get(refinement.Frozen(garment, normalizers, inverse))
     folder = directory / "refinement"
-    if jax.process_index() == 0 and not checkpoint.steps(folder / "checkpoints"):
-        shutil.rmtree(folder / refinement.ROUNDS, ignore_errors=True)  # played by a training that came to nothing
     update = refinement.make_update(whole.scene, reel, kept, frozen, config, folder, STEPS_PER_CALL, device_mesh)
     fitted = fit.fit(
         update,

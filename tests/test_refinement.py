@@ -99,6 +99,12 @@ def test_an_interrupted_refinement_goes_on_bit_for_bit(wide, tmp_path):
     half = taken(updates(tmp_path / "two"), refinement.init(predictor, whole.config), 3)
     assert_same(at_once, taken(updates(tmp_path / "two"), jax.tree.map(jnp.array, half), 1))
 
+    # what a training left that came to nothing is not learnt from
+    strange = jax.tree.map(lambda x: 2 * x, refinement._read(tmp_path / "one" / refinement.ROUNDS / "000.npz"))
+    refinement._write(tmp_path / "three" / refinement.ROUNDS / "000.npz", strange)
+    first = [taken(updates(tmp_path / name), refinement.init(predictor, whole.config), 1) for name in ("three", "four")]
+    assert_same(*first)
+
     (tmp_path / "two" / refinement.ROUNDS / "000.npz").unlink()
     with pytest.raises(ValueError, match=r"000\.npz is gone"):
         updates(tmp_path / "two")(jax.tree.map(jnp.array, half))
