@@ -198,6 +198,16 @@ def descend(
     return latent
 
 
+def onward(latent: Array, change: Array, garment: Callable[[Array], Array], potential: Callable[[Array], Array]) -> Array:
+    """Where the steps of `descend` begin: the last code [L], plus its last change if the potential is lower there.
+
+    From the last code alone, what a few steps leave undone is like a drag on the cloth. The sum is far off where the
+    motion changes at once.
+    """
+    here, there = latent, latent + change
+    return jnp.where(potential(garment(there)) < potential(garment(here)), there, here)
+
+
 def hessian(energy: Callable[[Array], Array], latent: Array) -> Array:
     """The Hessian [L, L] in J of an energy of codes, at a code [L]."""
 
@@ -241,7 +251,7 @@ def step(
     """
 
     if "inverse_hessian" in params:
-        fixed, now = jax.lax.stop_gradient((params, state.latent))
+        fixed, now, change = jax.lax.stop_gradient((params, state.latent, state.change))
 
         def garment(latent):
             return decode(fixed, scene, character, latent, window, model)
@@ -250,7 +260,8 @@ def step(
             # the Hessian in the space of codes hardly changes but for contact
             return jnp.matmul(fixed["inverse_hessian"], gradient, precision="highest")
 
-        guess = descend(precondition, now, garment, potential, model.descent_steps, model.descent_bound)
+        start = onward(now, change, garment, potential)
+        guess = descend(precondition, start, garment, potential, model.descent_steps, model.descent_bound)
         guessed = garment(guess)
     else:
         guess = 0.0

@@ -156,8 +156,8 @@ class ModelConfig:
     latent: int = 400
     """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
     latent_update: Literal["absolute", "descent"] = "descent"
-    """Whether the network gives Z as in the thesis, or what is missing from a guess: the current frame's Z after some
-    steps down the potential of the garment that it decodes to."""
+    """Whether the network gives Z as in the thesis, or what is missing from a guess: the current frame's Z, and
+    its last change where that helps, after some steps down the potential of the garment that it decodes to."""
     descent_steps: int = 16
     """Conjugate-gradient steps of the guess."""
     descent_samples: int = 24

@@ -53,6 +53,7 @@ def start(character: Character, window: Window, memory_size: int) -> ClothState:
         velocity=now - characters.skinned(character, window.previous),
         acceleration=jnp.zeros_like(now),
         latent=jnp.zeros(memory_size, now.dtype),
+        change=jnp.zeros(memory_size, now.dtype),
     )
 
 
@@ -155,7 +156,8 @@ def take(
 
     new, latent, seen = animate(state, poses, window, step, potential)
     velocity = new - state.position
-    return ClothState(new, velocity, velocity - state.velocity, latent), Taken(new, step, seen)
+    taken = ClothState(new, velocity, velocity - state.velocity, latent, latent - state.latent)
+    return taken, Taken(new, step, seen)
 
 
 def follow(state: ClothState, advance: Array) -> ClothState:
@@ -170,7 +172,7 @@ def settle(animate: Animator, scene: Scene, character: Character, poses: Pose, c
         return state
     resting = state._replace(velocity=jnp.zeros_like(state.velocity))
     settled, _ = take(animate, scene, character, resting, motion.standing(poses), config.stage1.start_timestep, config)
-    return settled._replace(velocity=state.velocity, acceleration=state.acceleration)
+    return settled._replace(velocity=state.velocity, acceleration=state.acceleration, change=state.change)
 
 
 def training_rollout(
@@ -212,6 +214,7 @@ def training_rollout(
         taken = taken._replace(
             velocity=jnp.where(fresh, state.velocity, taken.velocity),
             acceleration=jnp.where(fresh, 0.0, taken.acceleration),
+            change=jnp.where(fresh, 0.0, taken.change),
         )
         taken = follow(taken, chosen.translation[2])
         frame = jnp.where(fresh, frame, frame + 1)

@@ -37,7 +37,7 @@ def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, 
     def state(character: Character, before: Array, now: Array, poses: Pose) -> Problem:
         window = characters.window(scene, character, poses)
         velocity = now - (before + poses.translation[0][None])
-        cloth = ClothState(now, velocity, jnp.zeros_like(now), jnp.zeros(0, now.dtype))
+        cloth = ClothState(now, velocity, jnp.zeros_like(now), *[jnp.zeros(0, now.dtype)] * 2)
         step = rollout.time_step(scene, character, cloth, window, 1.0 / config.fps, config)
         held = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
         skinned = characters.skinned(character, window.following)

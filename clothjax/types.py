@@ -107,6 +107,7 @@ class ClothState(NamedTuple):
     velocity: Array  # [V, 3] m per frame
     acceleration: Array  # [V, 3] m per frame^2
     latent: Array  # [L] the code that produced `position`
+    change: Array  # [L] of the code in the last frame
 
 
 class EdgeSet(NamedTuple):

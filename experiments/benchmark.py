@@ -52,10 +52,17 @@ SCENES = ["configs/quickstart.yaml"]
 PAPER = ["configs/paper_tshirt.yaml"]
 ROUNDS = 100  # of inference
 QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
+QUICK_SIZES = (500, 1000)
+QUICK_SCENES = ("full", "no_bending")
 PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
-QUICK_PARETO = {"rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",)}
+QUICK_PARETO = {
+    "rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",), "descent_steps": (1,), "iterations": (1, 500),
+}  # fmt: skip
 QUICK_GARMENTS = ("tshirt",)
-QUICK = ["configs/quickstart.yaml", "--model.body_nodes", "updated"]
+QUICK = [  # what compiles soonest
+    "configs/quickstart.yaml", "--model.body_nodes", "updated", "--model.width", "16", "--model.latent_update", "absolute",
+    "--physics.contact_surface", "centroids", "--physics.no-edge_contact",
+]  # fmt: skip
 
 
 def main(argv: list[str]) -> None:
@@ -149,12 +156,13 @@ def earlier(path: Path) -> dict:
 def training_step(quick: bool) -> dict:
     """All figures of stage 1."""
     config = configuration.cli(Config, QUICK if quick else PAPER)
-    small = configuration.cli(Config, [*SCENES, "--garment", config.garment])
-    rounds = 3 if quick else 5
+    small = config if quick else configuration.cli(Config, [*SCENES, "--garment", config.garment])
+    rounds, sizes = (3, QUICK_SIZES) if quick else (5, scaling.SIZES)
+    names = QUICK_SCENES if quick else tuple(scenes.SCENES)
     parts = {
         "the processor, the convolution, compilation, the step": lambda: stage1.measure(config, rounds),
-        "growth with the vertices": lambda: scaling.measure(config, rounds, scaling.SMALL if quick else scaling.SIZES),
-        "scenes": lambda: {"scenes": scenes.measure(small, rounds)},
+        "growth with the vertices": lambda: scaling.measure(config, rounds, sizes),
+        "scenes": lambda: {"scenes": scenes.measure(small, rounds, names)},
     }
     report = {}
     for name, measure in parts.items():

@@ -43,6 +43,14 @@ def test_one_step_reaches_the_minimum_of_a_quadratic(coded):
     assert float(jnp.linalg.norm(done - START)) == pytest.approx(0.1, rel=1e-2)
 
 
+def test_the_descent_begins_where_the_code_is_going_unless_that_is_worse(coded):
+    _, decode, potential = coded
+    nearer, farther = 0.3 * (GOAL - START), 3.0 * (GOAL - START)
+    np.testing.assert_array_equal(compact_latent.onward(START, nearer, decode, potential), START + nearer)
+    np.testing.assert_array_equal(compact_latent.onward(START, farther, decode, potential), START)
+    np.testing.assert_array_equal(compact_latent.onward(START, jnp.full(3, jnp.nan), decode, potential), START)
+
+
 def test_steps_are_conjugate():
     """Without a preconditioner, as many steps as there are codes reach the minimum of an uneven quadratic."""
     weights = jnp.array([1.0, 30.0, 400.0])

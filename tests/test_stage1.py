@@ -126,6 +126,8 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     # an untrained network hardly moves the cloth: it stays where it was skinned and keeps the body's velocity
     assert float(jnp.max(jnp.linalg.norm(cloth.position - skinned, axis=-1))) < 0.02
     np.testing.assert_array_equal(cloth.velocity, one.cloth.velocity)
+    assert np.abs(cloth.latent).max() > 0
+    np.testing.assert_array_equal(cloth.change, 0.0)  # going to where it rests is no motion
     expected = {"stretching", "bending", "gravity", "inertia", "friction", "collision", "edge_collision"}
     assert set(terms) == expected  # no self-contact: it is off
 

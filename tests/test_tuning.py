@@ -45,7 +45,7 @@ def test_psi_in_training_is_psi_in_use(toy):
     around = motion.poses(jax.tree.map(jnp.asarray, experiment.windows(clip)), 2)
     window = characters.window(whole.scene, character, around)
     code = latent_predictor.denormalise(normalizers.latent, state.latent)
-    cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code)
+    cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code, 0 * code)
     new, latent, seen = jax.jit(lambda c: animate(c, around, window, None, None))(cloth)
     assert seen is None
     np.testing.assert_allclose(latent_predictor.normalise(normalizers.latent, latent), following.latent, atol=1e-5)
@@ -79,7 +79,7 @@ def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
     root = np.random.default_rng(0).normal(size=(size, size))
     inverse = root @ root.T + np.eye(size)
     last = max(name for name in predictor if name.startswith("dense"))
-    cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), jnp.zeros(size))
+    cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), *(jnp.zeros(size) for _ in range(2)))
 
     def found(inverse):
         make = tuning.psi(garment, normalizers, kept, inverse, 0.5)

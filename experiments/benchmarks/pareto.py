@@ -82,13 +82,22 @@ class Case(NamedTuple):
     clips: list[Motion]
 
 
-def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tuple[str, ...] = ()) -> dict:
+def measure(
+    runs: list[Path],
+    rounds: int,
+    frames: int,
+    gaps: int,
+    motions: tuple[str, ...] = (),
+    descent_steps: tuple[int, ...] = DESCENT_STEPS,
+    iterations: tuple[int, ...] = ITERATIONS,
+) -> dict:
     """Points of all runs, and what wins where a garment has runs of NCS beside runs of Psi.
 
     Args:
         runs: folders of runs and of packed models; those of one garment are compared with each other.
         frames: of each motion; gaps: of them, at how many the solver is asked.
         motions: default: those on which all runs of a garment are evaluated.
+        descent_steps: of Phi; iterations: of the solver, of which the last is until it has converged.
 
     Raises:
         ValueError: if runs of a garment differ in body, physics, cloth or motions.
@@ -100,7 +109,7 @@ def measure(runs: list[Path], rounds: int, frames: int, gaps: int, motions: tupl
     points = []
     with progress("garments", len(garments)) as report, tempfile.TemporaryDirectory() as folder:
         for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items())):
-            variants, solved = _every(case, of_it, Path(folder))
+            variants, solved = _every(case, of_it, Path(folder), descent_steps, iterations)
             us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
             for key, each in variants.items():
                 found = {"name": key[1], "run": _short(key[0]), "family": each.family, "garment": garment}
@@ -201,7 +210,9 @@ def _case(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
     return Case(whole, character, clips)
 
 
-def _every(case: Case, runs: list[Path], folder: Path) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
+def _every(
+    case: Case, runs: list[Path], folder: Path, descent_steps: tuple[int, ...], iterations: tuple[int, ...]
+) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
     """All variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
@@ -210,9 +221,9 @@ def _every(case: Case, runs: list[Path], folder: Path) -> tuple[dict[tuple[str, 
             found = _peer(case, run, folder)
         else:
             found = _psi(case, run, network or "psi", folder)
-            found |= {} if network else _phi(case, run)
+            found |= {} if network else _phi(case, run, descent_steps)
         variants |= {(str(run), name): each for name, each in found.items()}
-    solver, solved = _solver(case)
+    solver, solved = _solver(case, iterations)
     others = solver | _position_based(case, [track[0] for track in solved])
     return variants | {("", name): each for name, each in others.items()}, solved
 
@@ -266,14 +277,14 @@ def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
     return run(local) - local.translation[:, None]
 
 
-def _phi(case: Case, run: Path) -> dict[str, Variant]:
+def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Variant]:
     """Phi with more and fewer steps of its descent, in jax."""
     config, model = trained.phi(run)
     case = case._replace(whole=experiment.assemble(config))  # with the graph that it was trained on
     if config.model.latent_update != "descent":
         return {"phi": _loop(case, config, model)}
     varied = {
-        n: dataclasses.replace(config, model=dataclasses.replace(config.model, descent_steps=n)) for n in DESCENT_STEPS
+        n: dataclasses.replace(config, model=dataclasses.replace(config.model, descent_steps=n)) for n in descent_steps
     }
     return {f"phi, {n} steps": _loop(case, each, model) for n, each in varied.items()}
 
@@ -339,10 +350,10 @@ def _peer(case: Case, run: Path, folder: Path) -> dict[str, Variant]:
     return variants
 
 
-def _solver(case: Case) -> tuple[dict[str, Variant], list[np.ndarray]]:
+def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], list[np.ndarray]]:
     """The reference solver, stopped after some iterations; and its loops when it is not."""
     whole, variants, solved = case.whole, {}, []
-    for iterations in ITERATIONS:
+    for iterations in limits:
         tracks, us, converged = [], [], []
         for clip in case.clips:
             clock = [time.perf_counter()]
@@ -357,7 +368,7 @@ def _solver(case: Case) -> tuple[dict[str, Variant], list[np.ndarray]]:
             us.append(1e6 * np.median(np.diff(clock)))  # the first frame compiles
             tracks.append(track[:-1])
             converged += [bool(info.converged) for info in infos]
-        last = iterations == ITERATIONS[-1]
+        last = iterations == limits[-1]
         name = "solver" if last else f"solver, {iterations} iteration{'s' * (iterations > 1)}"
         variants[name] = Variant("solver", "jax", tracks, None, float(np.median(us)), float(np.mean(converged)))
         solved = tracks

@@ -17,7 +17,6 @@ from experiments.benchmarks.timing import interleaved, program
 from experiments.session import progress
 
 SIZES = (500, 1000, 2000, 4000, 8000, 20000)
-SMALL = (500, 1000, 2000)
 
 
 def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
