@@ -198,7 +198,9 @@ def descend(
     return latent
 
 
-def onward(latent: Array, change: Array, garment: Callable[[Array], Array], potential: Callable[[Array], Array]) -> Array:
+def onward(
+    latent: Array, change: Array, garment: Callable[[Array], Array], potential: Callable[[Array], Array]
+) -> Array:
     """Where the steps of `descend` begin: the last code [L], plus its last change if the potential is lower there.
 
     From the last code alone, what a few steps leave undone is like a drag on the cloth. The sum is far off where the

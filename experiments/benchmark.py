@@ -1,7 +1,7 @@
 """Measures how fast and how small the parts are, each beside something it is compared with, in one interleaved run.
 
     python -m experiments.benchmark --json benchmark.json --plot benchmark.png     # all parts, one after the other
-    python -m experiments.benchmark --quick                                        # small networks and few rounds
+    python -m experiments.benchmark --quick                                        # see below
     python -m experiments.benchmark --compare old.json                             # ratios, and what is beyond noise
     python -m experiments.benchmark --part stage1                                  # the paper's Phi, 4 000 vertices
     python -m experiments.benchmark --part inference                               # Psi on one thread, beside NCS
@@ -27,6 +27,9 @@ motions. Phi and the solver are loops and take no turns: their times are of whol
 Errors are those of `experiments.evaluate`, in closed loop on motions held out of training; `swing_error` is the rms
 error of the velocity of what skinning does not do, over the solver's.
 
+`--quick` tries that it all works: a small Phi, few rounds and frames, one garment; and not what mostly compiles, the
+times of compilation, the growth with vertices and the scenes.
+
 With `--compare OLD.json` the times of both reports are set beside each other, and those flagged whose ratio is beyond
 the noise of both; of `pareto`, also whether both put the points in the same order (Kendall's tau).
 """
@@ -50,18 +53,17 @@ from experiments.session import fail_clearly, setup
 PARTS = ("stage1", "inference", "pareto")
 SCENES = ["configs/quickstart.yaml"]
 PAPER = ["configs/paper_tshirt.yaml"]
-ROUNDS = 100  # of inference
+ROUNDS, QUICK_ROUNDS = 5, 3  # of training steps
+INFERENCE = {"rounds": 100}
 QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
-QUICK_SIZES = (500, 1000)
-QUICK_SCENES = ("full", "no_bending")
 PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
 QUICK_PARETO = {
     "rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",), "descent_steps": (1,), "iterations": (1, 500),
 }  # fmt: skip
 QUICK_GARMENTS = ("tshirt",)
 QUICK = [  # what compiles soonest
-    "configs/quickstart.yaml", "--model.body_nodes", "updated", "--model.width", "16", "--model.latent_update", "absolute",
-    "--physics.contact_surface", "centroids", "--physics.no-edge_contact",
+    "configs/quickstart.yaml", "--model.body_nodes", "updated", "--model.width", "16",
+    "--model.latent_update", "absolute", "--physics.contact_surface", "centroids", "--physics.no-edge_contact",
 ]  # fmt: skip
 
 
@@ -71,7 +73,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--part", choices=PARTS, default=None, help="default: all")
     parser.add_argument("--json", type=Path, default=Path("benchmark.json"))
     parser.add_argument("--plot", type=Path, default=None, help="default: beside the JSON")
-    parser.add_argument("--quick", action="store_true", help="a small network and few rounds")
+    parser.add_argument("--quick", action="store_true", help="a small network, few rounds, little compilation")
     parser.add_argument("--compare", type=Path, default=None, help="the JSON of an earlier run")
     arguments = parser.parse_args(argv)
     if arguments.part not in (None, "pareto") and arguments.runs:
@@ -82,12 +84,7 @@ def main(argv: list[str]) -> None:
         report = each_part(arguments.runs, arguments.quick, path, plot)
     else:
         report = measure(arguments.part, arguments.runs, arguments.quick)
-        drawn = plot.with_suffix(f".{arguments.part}{plot.suffix}")
-        drawn.parent.mkdir(parents=True, exist_ok=True)
-        {"stage1": scaling, "inference": inference, "pareto": pareto}[arguments.part].plot(
-            report[arguments.part], drawn
-        )
-        print(f"drawn in {drawn}")
+        draw(report, arguments.part, plot.with_suffix(f".{arguments.part}{plot.suffix}"))
     if before:
         report["compare"] = comparison.compare(report, before)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,6 +93,15 @@ def main(argv: list[str]) -> None:
     if before:
         print("\n".join(comparison.lines(report["compare"])))
     print(f"written to {path}")
+
+
+def draw(report: dict, part: str, path: Path) -> None:
+    """The plot of a part; none of a quick one of stage 1, which has no growth to be drawn."""
+    if part == "stage1" and "seconds_by_vertices" not in report[part]:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    {"stage1": scaling, "inference": inference, "pareto": pareto}[part].plot(report[part], path)
+    print(f"drawn in {path}")
 
 
 def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
@@ -129,7 +135,7 @@ def measure(part: str, names: list[str], quick: bool) -> dict:
     else:
         inference.one_thread()
         if part == "inference":
-            measured = inference.measure(**QUICK_INFERENCE) if quick else inference.measure(ROUNDS)
+            measured = inference.measure(**(QUICK_INFERENCE if quick else INFERENCE))
         else:
             names = names or (QUICK_GARMENTS if quick else trained.shipped())
             runs = [trained.folder(name) if name in trained.shipped() else Path(name) for name in names]
@@ -156,13 +162,13 @@ def earlier(path: Path) -> dict:
 def training_step(quick: bool) -> dict:
     """All figures of stage 1."""
     config = configuration.cli(Config, QUICK if quick else PAPER)
-    small = config if quick else configuration.cli(Config, [*SCENES, "--garment", config.garment])
-    rounds, sizes = (3, QUICK_SIZES) if quick else (5, scaling.SIZES)
-    names = QUICK_SCENES if quick else tuple(scenes.SCENES)
+    if quick:
+        return stage1.measure(config, QUICK_ROUNDS, compiling=False)
+    small = configuration.cli(Config, [*SCENES, "--garment", config.garment])
     parts = {
-        "the processor, the convolution, compilation, the step": lambda: stage1.measure(config, rounds),
-        "growth with the vertices": lambda: scaling.measure(config, rounds, sizes),
-        "scenes": lambda: {"scenes": scenes.measure(small, rounds, names)},
+        "the processor, the convolution, compilation, the step": lambda: stage1.measure(config, ROUNDS),
+        "growth with the vertices": lambda: scaling.measure(config, ROUNDS, scaling.SIZES),
+        "scenes": lambda: {"scenes": scenes.measure(small, ROUNDS)},
     }
     report = {}
     for name, measure in parts.items():

@@ -29,8 +29,10 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.setattr(benchmark.configuration, "cli", lambda *_: config)
     monkeypatch.setattr(stage1, "CONVOLUTION", (3, 4))
-    monkeypatch.setattr(benchmark, "QUICK_SIZES", (300, 400))
-    benchmark.main(["--part", "stage1", "--quick", "--json", str(tmp_path / "b.json")])
+    monkeypatch.setattr(scaling, "SIZES", (300, 400))
+    monkeypatch.setattr(benchmark, "ROUNDS", 3)
+    monkeypatch.setattr(scenes, "SCENES", {name: scenes.SCENES[name] for name in ("full", "no_bending")})
+    benchmark.main(["--part", "stage1", "--json", str(tmp_path / "b.json")])
     report = json.loads((tmp_path / "b.json").read_text())
     assert json.dumps(report, indent=1) in capsys.readouterr().out
     figures = report["stage1"]

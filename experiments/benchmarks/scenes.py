@@ -87,14 +87,13 @@ def _standing(whole: Experiment):
     return clips.concatenate([pose], [""], [np.zeros(0, int)], 2)
 
 
-def measure(config: Config, rounds: int, names: tuple[str, ...]) -> dict:
-    """Flops, bytes and seconds of a training step in some scenes, compiled without loops, and ratios to the full one,
-    which has to be among them."""
+def measure(config: Config, rounds: int) -> dict:
+    """Flops, bytes and seconds of a training step in each scene, compiled without loops, and ratios to the full one."""
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
     whole = experiment.assemble(config)
     programs = {}
-    with timing.unrolled(), progress("compiling each scene", len(names)) as report:
-        for name in names:
+    with timing.unrolled(), progress("compiling each scene", len(SCENES)) as report:
+        for name in SCENES:
             programs[name] = program(*update(build(whole, name)))
             report(len(programs))
     seconds = interleaved(programs, rounds)

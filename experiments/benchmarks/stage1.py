@@ -34,13 +34,17 @@ class Moment(NamedTuple):
     first: training.FirstStep
 
 
-def measure(config: Config, rounds: int) -> dict:
-    """All figures of a training step at a configuration whose body nodes take part in message passing."""
+def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
+    """All figures of a training step at a configuration whose body nodes take part in message passing.
+
+    Args:
+        compiling: measures too how long compilation takes.
+    """
     whole = experiment.assemble(config)
     moment = first_moment(whole)
     report = {"vertices": len(whole.garment.vertices), "width": config.model.width}
-    parts = (lambda: processor(whole, moment, rounds), lambda: convolution(whole, rounds), lambda: compilation(whole),
-             lambda: step(whole, moment, rounds))  # fmt: skip
+    parts = [lambda: processor(whole, moment, rounds), lambda: convolution(whole, rounds)]
+    parts += [lambda: compilation(whole)] * compiling + [lambda: step(whole, moment, rounds)]
     with progress("measuring", len(parts)) as done:
         for index, part in enumerate(parts):
             report |= part()
