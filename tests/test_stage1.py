@@ -73,7 +73,9 @@ def _play(whole, reel, params, motion, advance_turn):
     poses = jax.tree.map(jnp.asarray, experiment.windows(moved))
     poses = jax.vmap(lambda t: clips.poses(poses, t))(jnp.arange(1, 20))
     character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
-    new, _, _ = jax.jit(lambda poses: rollout.play(params, scene, character, poses, config))(poses)
+    new, states, _ = jax.jit(lambda poses: rollout.play(params, scene, character, poses, config))(poses)
+    np.testing.assert_allclose(states.change[1:], np.diff(states.latent, axis=0), atol=1e-6)
+    np.testing.assert_array_equal(states.change[0], 0.0)  # not what settling changed
     return np.asarray(new), np.asarray(character.joints[0])
 
 
