@@ -1,7 +1,7 @@
 """Measures how fast and how small the parts are, each beside something it is compared with, in one interleaved run.
 
     python -m experiments.benchmark --json benchmark.json --plot benchmark.png     # all parts, one after the other
-    python -m experiments.benchmark --quick                                        # see below
+    python -m experiments.benchmark --quick                                        # that it all works
     python -m experiments.benchmark --compare old.json                             # ratios, and what is beyond noise
     python -m experiments.benchmark --part stage1                                  # the paper's Phi, 4 000 vertices
     python -m experiments.benchmark --part inference                               # Psi on one thread, beside NCS
@@ -27,7 +27,7 @@ motions. Phi and the solver are loops and take no turns: their times are of whol
 Errors are those of `experiments.evaluate`, in closed loop on motions held out of training; `swing_error` is the rms
 error of the velocity of what skinning does not do, over the solver's.
 
-`--quick` tries that it all works: a small Phi, few rounds and frames, one garment; and not what mostly compiles, the
+`--quick` is not for its figures: a small Phi, few rounds and frames, one garment; and not what mostly compiles, the
 times of compilation, the growth with vertices and the scenes.
 
 With `--compare OLD.json` the times of both reports are set beside each other, and those flagged whose ratio is beyond
@@ -58,7 +58,8 @@ INFERENCE = {"rounds": 100}
 QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
 PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
 QUICK_PARETO = {
-    "rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",), "descent_steps": (1,), "iterations": (1, 500),
+    "rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",),
+    "descent_steps": pareto.DESCENT_STEPS[:1], "iterations": pareto.ITERATIONS[-1:],
 }  # fmt: skip
 QUICK_GARMENTS = ("tshirt",)
 QUICK = [  # what compiles soonest
