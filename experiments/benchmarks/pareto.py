@@ -61,6 +61,7 @@ COLOURS = {
 }  # fmt: skip
 MARKERS = {"onnx": "o", "c": "^", "jax": "s", "warp": "D"}
 LEAST = {"energy_gap": 1e-5, "step_error_mm": 1e-3, "swing_error": 1e-3}  # where the plots begin
+MOST = {"energy_gap": 10.0, "step_error_mm": 100.0, "swing_error": 10.0}  # and end: cloth that has gone wrong
 
 
 class Variant(NamedTuple):
@@ -90,6 +91,7 @@ def measure(
     motions: tuple[str, ...] = (),
     descent_steps: tuple[int, ...] = DESCENT_STEPS,
     iterations: tuple[int, ...] = ITERATIONS,
+    shapes: dict[str, float] = SHAPES,
 ) -> dict:
     """Points of all runs, and what wins where a garment has runs of NCS beside runs of Psi.
 
@@ -98,6 +100,7 @@ def measure(
         frames: of each motion; gaps: of them, at how many the solver is asked.
         motions: default: those on which all runs of a garment are evaluated.
         descent_steps: of Phi; iterations: of the solver, of which the last is until it has converged.
+        shapes: names of the forms of Psi and of peers with fewer blend shapes, and the part of them that they have.
 
     Raises:
         ValueError: if runs of a garment differ in body, physics, cloth or motions.
@@ -109,7 +112,7 @@ def measure(
     points = []
     with progress("garments", len(garments)) as report, tempfile.TemporaryDirectory() as folder:
         for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items())):
-            variants, solved = _every(case, of_it, Path(folder), descent_steps, iterations)
+            variants, solved = _every(case, of_it, Path(folder), descent_steps, iterations, shapes)
             us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
             for key, each in variants.items():
                 found = {"name": key[1], "run": _short(key[0]), "family": each.family, "garment": garment}
@@ -211,16 +214,21 @@ def _case(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
 
 
 def _every(
-    case: Case, runs: list[Path], folder: Path, descent_steps: tuple[int, ...], iterations: tuple[int, ...]
+    case: Case,
+    runs: list[Path],
+    folder: Path,
+    descent_steps: tuple[int, ...],
+    iterations: tuple[int, ...],
+    shapes: dict[str, float],
 ) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
     """All variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
         network = trained.network(run)[0].peer.network
         if network in ("ncs", "snug"):
-            found = _peer(case, run, folder)
+            found = _peer(case, run, folder, shapes)
         else:
-            found = _psi(case, run, network or "psi", folder)
+            found = _psi(case, run, network or "psi", folder, shapes)
             found |= {} if network else _phi(case, run, descent_steps)
         variants |= {(str(run), name): each for name, each in found.items()}
     solver, solved = _solver(case, iterations)
@@ -240,7 +248,7 @@ def _skinning(case: Case, folder: Path) -> Variant:
     return Variant("skinning", "onnx", tracks, bound(path, peers.feed(path)))
 
 
-def _psi(case: Case, run: Path, family: str, folder: Path) -> dict[str, Variant]:
+def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
 
     In ONNX Runtime it is timed as peers are, with pose inputs and skinning transforms given; and, as in C, from the
@@ -252,7 +260,7 @@ def _psi(case: Case, run: Path, family: str, folder: Path) -> dict[str, Variant]
     forms = {family: folding.specialise(model)}
     forms |= {
         f"{family}, {name} of the shapes": folding.specialise(model, blendshapes=max(1, int(part * count)))
-        for name, part in SHAPES.items()
+        for name, part in shapes.items()
     }
     library, variants = native.build(folder) if native.compiler() else None, {}
     for name, form in forms.items():
@@ -302,7 +310,7 @@ def _loop(case: Case, config: Config, model: dict) -> Variant:
     return Variant("phi", "jax", tracks, None, float(np.median(us)))
 
 
-def _peer(case: Case, run: Path, folder: Path) -> dict[str, Variant]:
+def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float] = SHAPES) -> dict[str, Variant]:
     """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
     folder = Path(tempfile.mkdtemp(dir=folder))
     whole, character = case.whole, case.character
@@ -337,7 +345,7 @@ def _peer(case: Case, run: Path, folder: Path) -> dict[str, Variant]:
     forms = {network: peer}
     forms |= {
         f"{network}, {name} of the shapes": peers.fewer(peer, codes, max(1, int(part * codes.shape[1])))
-        for name, part in SHAPES.items()
+        for name, part in shapes.items()
     }
     variants, seen = {}, [frames(clip) for clip in case.clips]
     first = [skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:1], windows(c))) for c in case.clips]
@@ -421,7 +429,10 @@ def _moving(whole: Experiment) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot(report: dict, path: Path | BinaryIO) -> None:
-    """Each error against time, a row for each garment, with the fronts."""
+    """Each error against time, a row for each garment, with the fronts.
+
+    What is beyond the plot's ends is drawn at them.
+    """
     points = report["points"]
     garments = list(dict.fromkeys(point["garment"] for point in points))
     size = (5 * len(ERRORS), 4.2 * len(garments))
@@ -431,7 +442,7 @@ def plot(report: dict, path: Path | BinaryIO) -> None:
         for axis, (error, label) in zip(row, ERRORS.items()):
             for family, runtime in dict.fromkeys((point["family"], point["runtime"]) for point in of_it):
                 chosen = [point for point in of_it if (point["family"], point["runtime"]) == (family, runtime)]
-                where = [p["us"] for p in chosen], [max(p[error], LEAST[error]) for p in chosen]
+                where = [p["us"] for p in chosen], np.clip([p[error] for p in chosen], LEAST[error], MOST[error])
                 style = {"ms": 5, "alpha": 0.8, "color": COLOURS[family], "label": f"{family} ({runtime})"}
                 axis.loglog(*where, MARKERS[runtime], **style)
             front = sorted((p["us"], max(p[error], LEAST[error])) for p in of_it if p["front"][error])
