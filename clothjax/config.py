@@ -288,37 +288,6 @@ class PeerConfig:
 
 
 @dataclass(frozen=True)
-class RefinementConfig:
-    """Training of Psi on what the physics says it should have predicted in its own closed loops
-    (`clothjax/refinement.py`). Bodies and materials are those of stage 1."""
-
-    steps: int = 0
-    rounds: int = 20
-    """In each Psi is played anew ..."""
-    sequences: int = 32
-    """... on so many clips, ..."""
-    frames: int = 64
-    """... this many frames of each."""
-    descent_steps: int = 6
-    """Conjugate-gradient steps from a code that Psi predicted to the one it should have."""
-    noise: float = 0.1
-    """Standard deviation of the noise on codes that are read, in theirs, so that Psi learns to come back."""
-    vertex_stiffness: float = 650.0
-    """J/m^2. So much more than its energy an error of a code costs for the mean squared displacement of vertices: for
-    soft ways to move, where energy hardly tells right from wrong."""
-    batch: int = 256
-    learning_rate: float = 3e-4
-    clip: float = 1.0
-    ema: float = 0.999
-    """Decay per step of the averaged parameters, which are played and left."""
-    seed: int = 0
-
-    def __post_init__(self):
-        for name in ("rounds", "sequences", "frames", "descent_steps"):
-            _require(getattr(self, name) >= 1, f"refinement.{name} must be >= 1, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
 class Stage2Config:
     """Training of the latent predictor on the frozen teacher (21)."""
 
@@ -385,7 +354,6 @@ class Config:
     stage1: Stage1Config = field(default_factory=Stage1Config)
     stage2: Stage2Config = field(default_factory=Stage2Config)
     tuning: TuningConfig = field(default_factory=TuningConfig)
-    refinement: RefinementConfig = field(default_factory=RefinementConfig)
     peer: PeerConfig = field(default_factory=PeerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     directory: str = ""

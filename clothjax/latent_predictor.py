@@ -100,14 +100,6 @@ def predict(params: Params, latent: Array, pose: Array, constants: Array, decay:
     return (1.0 - decay) * latent + mlp(params, jnp.concatenate([latent, pose, constants]))
 
 
-class Inputs(NamedTuple):
-    """What the network reads, in standard deviations."""
-
-    code: Array  # [L]
-    pose: Array  # [P]
-    constants: Array  # [C]
-
-
 def advance(
     params: Params,
     code: Array,
@@ -118,8 +110,8 @@ def advance(
     kept: np.ndarray,
     normalizers: Normalizers,
     config: Config,
-) -> tuple[Array, Inputs]:
-    """The next code [L] in standard deviations, brought into its range as in use, and what it was predicted from.
+) -> Array:
+    """The next code [L] in standard deviations, brought into its range as in use.
 
     Args:
         code: [L] as it is; poses: a window of three; joints: [J, 3] m, of the shaped body; constants: [C].
@@ -127,10 +119,10 @@ def advance(
     Gradients pass as if nothing had been out of range.
     """
     pose = window_inputs(poses, joints, parents, kept, config.fps)
-    inputs = Inputs(normalise(normalizers.latent, code), normalise(normalizers.pose, pose), constants)
-    latent = predict(params, *inputs, config.stage2.latent_decay)
+    now, pose = normalise(normalizers.latent, code), normalise(normalizers.pose, pose)
+    latent = predict(params, now, pose, constants, config.stage2.latent_decay)
     inside, _ = bounded(latent, normalizers.latent.low, normalizers.latent.high)
-    return latent + jax.lax.stop_gradient(inside - latent), inputs
+    return latent + jax.lax.stop_gradient(inside - latent)
 
 
 def identity(size: int) -> Scale:

@@ -19,7 +19,7 @@ from clothjax.types import Material
 
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG = "model.npz", "config.yaml"
-STAGES = ("stage1", "stage2", "tuning", "refinement")
+STAGES = ("stage1", "stage2", "tuning")
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
 LARGE = 2000  # entries of a matrix that is worth eight bits
 

@@ -73,7 +73,7 @@ def psi(
         constants = latent_predictor.constant_inputs(character.betas, character.material, config.material)
 
         def animate(state: ClothState, poses: Pose, window: Window, _step: TimeStep, _potential: Callable):
-            latent, _ = latent_predictor.advance(
+            latent = latent_predictor.advance(
                 model["params"], state.latent, poses, character.joints, constants, scene.body.parents, kept,
                 normalizers, config,
             )  # fmt: skip

@@ -83,8 +83,7 @@ Garment {config.garment}, motion {", ".join(config.evaluation.motions)} (not tra
 {config.evaluation.betas_seed} within {config.evaluation.betas} standard deviations. Training took
 {figures["train_seconds"]:.0f} s: blend shapes and preconditioner {figures["start_seconds"]:.0f} s, stage 1
 {figures["stage1_seconds"]:.0f} s, the teacher's rollouts {figures["teacher_seconds"]:.0f} s, stage 2
-{figures["stage2_seconds"]:.0f} s, its tuning and refinement
-{figures.get("tuning_seconds", 0.0) + figures.get("refinement_seconds", 0.0):.0f} s, compilation
+{figures["stage2_seconds"]:.0f} s, its tuning {figures.get("tuning_seconds", 0.0):.0f} s, compilation
 {figures["compile_seconds"]:.0f} s.
 
 What the rows mean is in the docstring of `experiments/evaluate.py`. Gaps are over {config.evaluation.gap_frames}

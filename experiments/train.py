@@ -4,8 +4,8 @@
     python -m experiments.train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
     python -m experiments.train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
 
-It leaves `stage1/`, `stage2/` and, where their steps are not 0, `tuning/` and `refinement/` in the run's folder, each
-with checkpoints, metrics.jsonl and training.json.
+It leaves `stage1/`, `stage2/` and, where its steps are not 0, `tuning/` in the run's folder, each with checkpoints,
+metrics.jsonl and training.json.
 
 With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
 Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere each is told
@@ -14,7 +14,6 @@ Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere
 
 import argparse
 import dataclasses
-import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -34,7 +33,6 @@ from clothjax import (
     latent_predictor,
     preconditioner,
     principal_shapes,
-    refinement,
     rollout,
     run_folder,
     stage1,
@@ -62,7 +60,7 @@ def main(argv: list[str]) -> None:
     with devices.together(directory):
         wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
         batches = [config.stage1.batch, config.stage2.batch]
-        batches += [stage.batch for stage in (config.tuning, config.refinement) if stage.steps > 0]
+        batches += [config.tuning.batch] if config.tuning.steps > 0 else []
         try:
             train(config, directory, devices.choose(wanted, *batches))
         except FloatingPointError as error:
@@ -79,8 +77,7 @@ def run_directory(config: Config, argv: list[str]) -> Path:
 
 
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
-    """Both stages, the tuning and the refinement; returns the seconds each took, those of compilation, the
-    teacher and the start apart."""
+    """Both stages and the tuning; returns the seconds each took, those of compilation, teacher and start apart."""
     if device_mesh is not None:
         devices.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     whole = experiment.assemble(config)
@@ -128,7 +125,8 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         # were it not readable, training would go on from the one before, and stop at the first NaN
         teacher, seconds = stage2.blank(model, whole.scene, reel, joints, config), 0.0
     else:
-        _refuse_later(directory, "stage 2", "tuning", "refinement")
+        if checkpoint.steps(directory / "tuning" / "checkpoints"):  # it must not be taken for this one's
+            raise ValueError(f"{directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
         with progress("rolling out the teacher", config.stage2.sequences) as report:
             teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
     garment = jax.device_get(first.state.average["garment"])
@@ -141,7 +139,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         directory=directory / "stage2",
         config=kept,
         description=f"stage 2, {config.garment}",
-        may_differ=("directory", "evaluation", "tuning", "refinement"),
+        may_differ=("directory", "evaluation", "tuning"),
     )
     clock = {
         **_spent(directory, teacher_seconds=seconds),
@@ -149,19 +147,11 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
         "stage2_seconds": second.seconds,
         "compile_seconds": first.compile_seconds + second.compile_seconds,
     }
-    predictor = second.state.average
     if config.tuning.steps > 0:
-        if not checkpoint.steps(directory / "tuning" / "checkpoints"):
-            _refuse_later(directory, "tuning", "refinement")
-        third = _tune(whole, reel, model["params"], second.state, directory, device_mesh)
-        predictor = third.state.average
+        psi = second.state
+        third = tune(whole, reel, model["params"], psi.garment, psi.average, psi.normalizers, directory, device_mesh)
         clock["compile_seconds"] += third.compile_seconds
         clock["tuning_seconds"] = third.seconds
-    if config.refinement.steps > 0:
-        normalizers = second.state.normalizers
-        fourth = refine(whole, reel, model["params"], garment, predictor, normalizers, directory, device_mesh)
-        clock["compile_seconds"] += fourth.compile_seconds
-        clock["refinement_seconds"] = fourth.seconds
     return clock
 
 
@@ -198,44 +188,7 @@ def _train_peer(
     return {"stage1_seconds": fitted.seconds, "compile_seconds": fitted.compile_seconds}
 
 
-def _refuse_later(directory: Path, stage: str, *later: str) -> None:
-    """Where a stage begins, what was trained on an earlier one of it must not be taken for its own."""
-    for name in later:
-        if checkpoint.steps(directory / name / "checkpoints"):
-            raise ValueError(f"{directory / name} belongs to a {stage} that is no longer there: remove it")
-
-
-def _tune(
-    whole: experiment.Experiment,
-    reel: Clips,
-    phi: dict,
-    predictor: stage2.TrainingState,
-    directory: Path,
-    device_mesh: Mesh | None,
-) -> fit.Fitted:
-    """Psi after its regression, tuned on the gradients of the energies."""
-    config = whole.config
-    devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    psi = tuning.psi(
-        predictor.garment,
-        predictor.normalizers,
-        latent_predictor.kept_joints(whole.names, config.stage2),
-        phi.get("inverse_hessian"),
-        config.tuning.preconditioning,
-    )
-    return fit.fit(
-        stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
-        devices.replicate(tuning.init(predictor.average, whole.scene, reel, config), device_mesh),
-        steps=config.tuning.steps,
-        steps_per_call=STEPS_PER_CALL,
-        directory=directory / "tuning",
-        config=configuration.to_dict(config),
-        description=f"tuning, {config.garment}",
-        may_differ=("directory", "evaluation", "refinement"),
-    )
-
-
-def refine(
+def tune(
     whole: experiment.Experiment,
     reel: Clips,
     phi: dict,
@@ -245,33 +198,31 @@ def refine(
     directory: Path,
     device_mesh: Mesh | None = None,
 ) -> fit.Fitted:
-    """Psi refined, with the preconditioner of its Phi.
+    """Psi after its regression, tuned on the gradients of the energies, with the preconditioner of its Phi.
 
     Args:
         phi: parameters; garment: its decoder and blend shapes.
         directory: of the run.
     """
     config = whole.config
-    kept = latent_predictor.kept_joints(whole.names, config.stage2)
-    inverse = phi.get("inverse_hessian")
-    if inverse is None:
-        inverse = stage1.rest_inverse_hessian(garment, whole.scene, config)
-    frozen = jax.device_get(refinement.Frozen(garment, normalizers, inverse))
-    folder = directory / "refinement"
-    update = refinement.make_update(whole.scene, reel, kept, frozen, config, folder, STEPS_PER_CALL, device_mesh)
-    fitted = fit.fit(
-        update,
-        devices.replicate(refinement.init(predictor, config), device_mesh),
-        steps=config.refinement.steps,
+    devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
+    psi = tuning.psi(
+        garment,
+        normalizers,
+        latent_predictor.kept_joints(whole.names, config.stage2),
+        phi.get("inverse_hessian"),
+        config.tuning.preconditioning,
+    )
+    return fit.fit(
+        stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
+        devices.replicate(tuning.init(predictor, whole.scene, reel, config), device_mesh),
+        steps=config.tuning.steps,
         steps_per_call=STEPS_PER_CALL,
-        directory=folder,
+        directory=directory / "tuning",
         config=configuration.to_dict(config),
-        description=f"refinement, {config.garment}",
+        description=f"tuning, {config.garment}",
         may_differ=("directory", "evaluation"),
     )
-    if jax.process_index() == 0:
-        shutil.rmtree(folder / refinement.ROUNDS, ignore_errors=True)  # they are large, and of no more use
-    return fitted
 
 
 def _spent(directory: Path, **seconds: float) -> dict[str, float]:
@@ -283,7 +234,7 @@ def _spent(directory: Path, **seconds: float) -> dict[str, float]:
 
 
 # stage 1 does not read these, so a run may change them and go on
-DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning", "refinement")
+DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning")
 
 
 def load_phi(

@@ -22,7 +22,7 @@ from toy import small
 
 from clothjax import checkpoint, configuration, inference, run_folder, storage, trained
 from data_prep import amass, asf_amc, bvh, garment, smpl
-from experiments import benchmark, convert, demo, evaluate, gallery, quickstart, refine, render, sweep, thesis, train
+from experiments import benchmark, convert, demo, evaluate, gallery, quickstart, render, sweep, thesis, train, tune
 from experiments.session import fail_clearly
 
 CASES: dict = {}
@@ -574,8 +574,8 @@ def a_frame_after_the_end(folder):
 
 
 @case("coat", "skirt|no such")
-def a_garment_to_refine_that_is_not_there(folder):
-    return lambda: refine.main(["coat", "--out", str(folder / "out")])
+def a_garment_to_tune_that_is_not_there(folder):
+    return lambda: tune.main(["coat", "--out", str(folder / "out")])
 
 
 @case(r"old\.json", "not a report")

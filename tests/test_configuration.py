@@ -214,9 +214,3 @@ def test_the_vertices_that_a_stack_reaches(edges, level):
 def test_tuning_refuses_what_it_would_ignore(setting, said):
     with pytest.raises(ValueError, match=said):
         config.TuningConfig(steps=10, **setting)
-
-
-@pytest.mark.parametrize("setting", ["rounds", "sequences", "frames", "descent_steps"])
-def test_a_refinement_needs_at_least_one_of_each(setting):
-    with pytest.raises(ValueError, match=rf"refinement\.{setting} must be >= 1, got 0"):
-        config.RefinementConfig(**{setting: 0})

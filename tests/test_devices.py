@@ -17,7 +17,7 @@ import yaml
 from toy import assert_same, small
 
 from clothjax import checkpoint, configuration, devices
-from clothjax.config import RefinementConfig, TuningConfig
+from clothjax.config import TuningConfig
 from clothjax.trained import STAGES
 from experiments import train
 
@@ -99,7 +99,6 @@ def config(tmp_path_factory):
         stage1=dataclasses.replace(config.stage1, steps=20, pool=8, batch=4, restart_probability=0.5),
         stage2=dataclasses.replace(config.stage2, steps=20, batch=4, sequences=3),
         tuning=TuningConfig(steps=20, batch=4, pool=8),
-        refinement=RefinementConfig(steps=20, rounds=1, sequences=2, frames=4, batch=4),
     )
     path = tmp_path_factory.mktemp("several") / "small.yaml"
     path.write_text(yaml.safe_dump(json.loads(json.dumps(configuration.to_dict(config)))))
@@ -183,7 +182,7 @@ def pair(config, directory, *arguments):
 
 
 def trained(directory):
-    """What a training left: the parameters of Phi, of Psi, and of Psi after its tuning and its refinement."""
+    """What a training left: the parameters of Phi, of Psi, and of Psi after its tuning."""
     return [checkpoint.read(directory / stage / "checkpoints", "params")[0] for stage in STAGES]
 
 

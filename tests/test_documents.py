@@ -22,7 +22,6 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = ("README.md", "experiments/README.md")
 SHORT = [  # what makes long commands short, and no other difference
     (r"--(\S+)\.steps \d+", r"--\1.steps 20"),
-    (r"--refinement\.steps 20", "--refinement.steps 20 --refinement.rounds 1 --refinement.sequences 2"),
     (r"--garments tshirt_1000 dress_1000 --seeds 0 1 2", "--garments tshirt_1000 dress_1000 --seeds 0"),
     (r"(experiments\.(?:benchmark|stability).*)", r"\1 --quick"),
     (r"--quick --quick", "--quick"),

@@ -10,7 +10,7 @@ from PIL import Image
 from clothjax import checkpoint, clips, experiment, features, inference, metrics, scene, trained
 from clothjax.config import Config
 from clothjax.types import Motion
-from experiments import evaluate, gallery, quickstart, refine, render, stability, train
+from experiments import evaluate, gallery, quickstart, render, stability, train, tune
 from experiments.stress import closed_loop
 
 TOY = [
@@ -20,8 +20,7 @@ TOY = [
     "--evaluation.solver-frames", "12", "--evaluation.long-frames", "40",
     "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
-    "--tuning.steps", "20", "--tuning.pool", "4", "--refinement.steps", "40", "--refinement.rounds", "2",
-    "--refinement.sequences", "2", "--refinement.frames", "6", "--refinement.batch", "16",
+    "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
 
 
@@ -116,9 +115,6 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
 def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_refused(finished, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
-    shutil.rmtree(run / "refinement")
-    with pytest.raises(ValueError, match="refinement is at step 0 of 40"):
-        trained.pack(run, tmp_path / "packed")
     shutil.rmtree(run / "tuning")
     assert trained.psi(run)[0].tuning.steps == 20  # as stage 2 was told
     with pytest.raises(ValueError, match="tuning is at step 0 of 20"):
@@ -128,22 +124,15 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
     shutil.rmtree(run / "stage2")
     with pytest.raises(ValueError, match="tuning belongs to a stage 2 that is no longer there"):
         train.train(trained.phi(run)[0], run)
-    shutil.rmtree(run / "tuning")
-    shutil.copytree(finished / "refinement", run / "refinement")
-    with pytest.raises(ValueError, match="refinement belongs to a stage 2 that is no longer there"):
-        train.train(trained.phi(run)[0], run)
-    shutil.copytree(finished / "stage2", run / "stage2")
-    with pytest.raises(ValueError, match="refinement belongs to a tuning that is no longer there"):
-        train.train(trained.phi(run)[0], run)
 
 
-def test_a_packed_garment_is_refined_on_other_motions(finished, tmp_path):
+def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     trained.pack(finished, tmp_path / "packed")
-    settings = ["--motions", "dance_0", "--refinement.steps", "20", "--refinement.rounds", "1"]
-    settings += ["--refinement.learning-rate", "1e-2", "--refinement.ema", "0.5"]  # so that 20 steps are seen
-    refine.main([str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings])
+    settings = ["--motions", "dance_0", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
+    settings += ["--tuning.learning-rate", "1e-2", "--tuning.ema", "0.5"]  # so that 40 steps are seen
+    tune.main([str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings])
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))
-    assert config.motions == ("dance_0",) and config.refinement.steps == 20 and before.refinement.steps == 40
+    assert config.motions == ("dance_0",) and config.tuning.steps == 40 and before.tuning.steps == 20
     for (name, one), other in zip(checkpoint.named(phi).items(), checkpoint.named(phi_after).values(), strict=True):
         assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
     one, other = (trained.psi(tmp_path / name) for name in ("packed", "out"))
@@ -152,9 +141,9 @@ def test_a_packed_garment_is_refined_on_other_motions(finished, tmp_path):
     clip = experiment.motion(experiment.assemble(config), "dance_0")
     assert np.isfinite(evaluate.psi_trajectory(inference.load(tmp_path / "out"), clip)).all()
     with pytest.raises(ValueError, match="no garment called 'coat'"):
-        refine.main(["coat", "--out", str(tmp_path / "out")])
-    with pytest.raises(ValueError, match=r"refinement\.steps is 0"):
-        refine.main([str(tmp_path / "packed"), "--out", str(tmp_path / "none"), "--refinement.steps", "0"])
+        tune.main(["coat", "--out", str(tmp_path / "out")])
+    with pytest.raises(ValueError, match=r"tuning\.steps is 0"):
+        tune.main([str(tmp_path / "packed"), "--out", str(tmp_path / "none"), "--tuning.steps", "0"])
 
 
 @pytest.mark.slow

@@ -1,10 +1,9 @@
-"""Refines Psi of a garment that comes with the library, or of a packed one: on motions or bodies of yours.
+"""Tunes Psi of a garment that comes with the library, or of a packed one, further: on motions or bodies of yours.
 
-    python -m experiments.refine skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --refinement.steps 4000
+    python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000
 
 Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
-garment, for `clothjax.load` and all programs that take a run, and `refinement/`. Run again, it goes on where it
-stopped.
+garment, for `clothjax.load` and all programs that take a run, and `tuning/`. Run again, it goes on where it stopped.
 """
 
 import argparse
@@ -16,7 +15,7 @@ import jax
 from clothjax import configuration, experiment, latent_predictor, stage2, trained
 from clothjax.config import Config
 from experiments.session import fail_clearly, setup
-from experiments.train import refine
+from experiments.train import tune
 
 
 def main(argv: list[str]) -> None:
@@ -26,8 +25,8 @@ def main(argv: list[str]) -> None:
     given, settings = parser.parse_known_args(argv)
     folder = Path(given.garment) if trained.packed(given.garment) else trained.folder(given.garment)
     config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(given.out)])
-    if config.refinement.steps < 1:
-        raise ValueError("refinement.steps is 0: give --refinement.steps")
+    if config.tuning.steps < 1:
+        raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
     _, garment, predictor, normalizers = trained.psi(folder)
     whole = experiment.assemble(config)
@@ -35,8 +34,8 @@ def main(argv: list[str]) -> None:
     kept = latent_predictor.kept_joints(whole.names, config.stage2)
     seen = stage2.ordinary_poses(whole.scene, reel, kept, config)
     normalizers = normalizers._replace(pose=latent_predictor.widened(normalizers.pose, seen))
-    refined = refine(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
-    size = trained.write(given.out, config, phi, jax.device_get(refined.state.average), normalizers)
+    tuned = tune(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
+    size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
     print(f"{given.out}: {size / 1e6:.2f} MB of weights")
 
 
