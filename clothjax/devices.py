@@ -104,7 +104,7 @@ def choose(wanted: str, *batches: int) -> Mesh | None:
     if any(batch % count for batch in batches):
         raise ValueError(
             f"batches of {' and '.join(map(str, batches))} cannot be divided among {count} devices: "
-            "set stage1.batch, stage2.batch, tuning.batch to multiples"
+            "set stage1.batch, stage2.batch and tuning.batch to multiples"
         )
     return None if count == 1 else Mesh(np.array(there[:count]), (AXIS,))
 
