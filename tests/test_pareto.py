@@ -92,7 +92,7 @@ def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
     model["params"][last] = jax.tree.map(lambda x: 1000 * np.asarray(x), model["params"][last])
     monkeypatch.setattr(trained, "network", lambda _: (config, model))
     expected = _stages(case.whole, model, run)[network](case.character, case.clips[0])()
-    variants = pareto._peer(case, run, tmp_path)
+    variants = pareto._peer(case, run, tmp_path, pareto.SHAPES)
     far = {name: np.abs(each.tracks[0] - expected).max() for name, each in variants.items()}
     still = pareto._skinning(case, tmp_path).tracks[0]
     moved = np.abs(expected - still).max()
@@ -123,6 +123,7 @@ def test_the_quick_benchmark_of_a_shipped_garment(tmp_path):
     benchmark.main(["tshirt", "--part", "pareto", "--quick", "--json", str(path)])
     points = {p["name"]: p for p in json.loads(path.read_text())["pareto"]["points"]}
     assert {p["family"] for p in points.values()} == {"skinning", "psi", "phi", "solver"}
+    assert not any("of the shapes" in name for name in points)  # they take most of the time
     assert points["skinning"]["energy_gap"] == pytest.approx(1.0, abs=1e-3)
     assert points["solver"]["energy_gap"] < 1e-3 and points["solver"]["swing_error"] < 1e-6
     assert points["skinning"]["us"] < points["psi"]["us"] < points["solver"]["us"]

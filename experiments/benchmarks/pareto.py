@@ -310,7 +310,7 @@ def _loop(case: Case, config: Config, model: dict) -> Variant:
     return Variant("phi", "jax", tracks, None, float(np.median(us)))
 
 
-def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float] = SHAPES) -> dict[str, Variant]:
+def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
     folder = Path(tempfile.mkdtemp(dir=folder))
     whole, character = case.whole, case.character
