@@ -128,17 +128,18 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
 
 def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     trained.pack(finished, tmp_path / "packed")
-    settings = ["--motions", "dance_0", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
+    settings = ["--motions", "dance_3", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
     settings += ["--tuning.learning-rate", "1e-2", "--tuning.ema", "0.5"]  # so that 40 steps are seen
     tune.main([str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings])
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))
-    assert config.motions == ("dance_0",) and config.tuning.steps == 40 and before.tuning.steps == 20
+    assert config.motions == ("dance_3",) and config.tuning.steps == 40 and before.tuning.steps == 20
     for (name, one), other in zip(checkpoint.named(phi).items(), checkpoint.named(phi_after).values(), strict=True):
         assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
     one, other = (trained.psi(tmp_path / name) for name in ("packed", "out"))
     assert max(np.abs(a - b).max() for a, b in zip(jax.tree.leaves(one[2]), jax.tree.leaves(other[2]))) > 1e-3
     assert (other[3].pose.low <= one[3].pose.low).all() and (other[3].pose.high >= one[3].pose.high).all()
-    clip = experiment.motion(experiment.assemble(config), "dance_0")
+    assert (other[3].pose.low < one[3].pose.low).any() and (other[3].pose.high > one[3].pose.high).any()
+    clip = experiment.motion(experiment.assemble(config), "dance_3")
     assert np.isfinite(evaluate.psi_trajectory(inference.load(tmp_path / "out"), clip)).all()
     with pytest.raises(ValueError, match="no garment called 'coat'"):
         tune.main(["coat", "--out", str(tmp_path / "out")])
