@@ -272,8 +272,9 @@ def make_update(
             jax.tree.map(lambda x: jnp.mean(x, axis=0), gradients),  # over devices
             stage.ema,
         )
-        # a blown-up simulation starts anew at its next turn; so does one whose update was skipped
-        lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0) | ~jnp.isfinite(each)
+        # it starts anew at its next turn; so does one whose update was skipped
+        lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0)
+        lost |= ~(each < (jnp.inf if stage.lost is None else stage.lost))
         advance = jnp.where(simulations.fresh, frames - 1, frames)
         frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advance)
         cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)

@@ -14,7 +14,7 @@ from clothjax.config import Config
 @pytest.fixture(scope="module")
 def toy():
     config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
-    config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, steps=400))
+    config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, steps=400, lost=5e3))
     whole = experiment.assemble(config)
     reel, _ = experiment.training_clips(whole)
     return whole, reel
@@ -62,6 +62,24 @@ def test_a_step_with_a_nonfinite_gradient_changes_nothing_but_its_count(toy, upd
     after, metrics = update(broken)
     assert metrics["nonfinite"][0]
     assert_same(before, (after.params, after.average, after.optimizer, after.statistics))
+
+
+def test_a_simulation_whose_energy_tells_that_it_is_lost_is_begun_anew(toy, update):
+    whole, reel = toy
+    highest = whole.config.stage1.lost
+    state = stage1.init(whole.scene, reel, whole.config)
+    pool = state.pool._replace(fresh=jnp.zeros_like(state.pool.fresh))
+    usual, metrics = update(jax.tree.map(jnp.array, state._replace(pool=pool)))
+    assert not metrics["lost"][0] and float(metrics["loss"][0]) < highest
+    assert usual.pool.frame[0] == pool.frame[0] + 1
+    # metres away the cloth is at once torn back to the body
+    betas = np.array(pool.betas[0])
+    torn = pool._replace(cloth=pool.cloth._replace(position=pool.cloth.position.at[0].add(5.0)))
+    after, metrics = update(state._replace(pool=torn))
+    assert metrics["lost"][0] and float(metrics["loss"][0]) > highest and np.isfinite(metrics["loss"][0])
+    again = after._replace(step=jnp.int32(0))  # its next turn
+    _, begun = stage1.turn(again, whole.scene, jax.tree.map(jnp.asarray, reel), 1, whole.config)
+    assert np.abs(begun.betas[0] - betas).max() > 0
 
 
 def _play(whole, reel, params, motion, advance_turn):
