@@ -47,7 +47,7 @@ import jax
 
 from clothjax import configuration, trained
 from clothjax.config import Config
-from experiments.benchmarks import comparison, inference, pareto, scaling, scenes, stage1, timing
+from experiments.benchmarks import comparison, inference, pareto, scaling, scenes, stage1, timing, variants
 from experiments.session import fail_clearly, setup
 
 PARTS = ("stage1", "inference", "pareto")
@@ -59,7 +59,7 @@ QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
 PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
 QUICK_PARETO = {
     "rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",),
-    "descent_steps": pareto.DESCENT_STEPS[:1], "iterations": pareto.ITERATIONS[-1:], "shapes": {},
+    "descent_steps": variants.DESCENT_STEPS[:1], "iterations": variants.ITERATIONS[-1:], "shapes": {},
 }  # fmt: skip
 QUICK_GARMENTS = ("tshirt",)
 QUICK = [  # what compiles soonest

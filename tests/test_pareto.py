@@ -11,7 +11,7 @@ from test_peers import settings
 
 from clothjax import trained
 from experiments import benchmark, train
-from experiments.benchmarks import pareto
+from experiments.benchmarks import pareto, variants
 from experiments.evaluate import _stages
 
 
@@ -84,7 +84,7 @@ def run(request, tmp_path_factory):
 
 
 def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
-    case = pareto._case([run], ("walk_3",), 10)
+    case = variants.prepare([run], ("walk_3",), 10)
     config, model = trained.network(run)
     network = config.peer.network
     # so short a training hardly moves the cloth
@@ -92,9 +92,9 @@ def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
     model["params"][last] = jax.tree.map(lambda x: 1000 * np.asarray(x), model["params"][last])
     monkeypatch.setattr(trained, "network", lambda _: (config, model))
     expected = _stages(case.whole, model, run)[network](case.character, case.clips[0])()
-    variants = pareto._peer(case, run, tmp_path, pareto.SHAPES)
-    far = {name: np.abs(each.tracks[0] - expected).max() for name, each in variants.items()}
-    still = pareto._skinning(case, tmp_path).tracks[0]
+    found = variants._peer(case, run, tmp_path, variants.SHAPES)
+    far = {name: np.abs(each.tracks[0] - expected).max() for name, each in found.items()}
+    still = variants._skinning(case, tmp_path).tracks[0]
     moved = np.abs(expected - still).max()
     assert far[network] < 2e-5 and moved > 1e-3 and far[f"{network}, int8"] < 0.3 * moved
     half, eighth = (far[f"{network}, {part} of the shapes"] for part in ("a half", "an eighth"))
@@ -108,14 +108,14 @@ def test_what_was_trained_for_something_else_is_not_compared(run, monkeypatch):
     read = {"one": config, "two": other}
     monkeypatch.setattr(trained, "network", lambda name: (read[str(name)], model))
     with pytest.raises(ValueError, match="two: trained with another physics and motions than one"):
-        pareto._case([Path("one"), Path("two")], (), 10)
+        variants.prepare([Path("one"), Path("two")], (), 10)
     thinner = dataclasses.replace(config, evaluation=dataclasses.replace(config.evaluation, betas=0.3))
     read["two"] = thinner
     with pytest.raises(ValueError, match="two: trained with another betas than one"):
-        pareto._case([Path("one"), Path("two")], (), 10)
+        variants.prepare([Path("one"), Path("two")], (), 10)
     read["two"] = dataclasses.replace(config, evaluation=dataclasses.replace(config.evaluation, motions=("jump_0",)))
     with pytest.raises(ValueError, match="no motion is held out by all"):
-        pareto._case([Path("one"), Path("two")], (), 10)
+        variants.prepare([Path("one"), Path("two")], (), 10)
 
 
 def test_the_quick_benchmark_of_a_shipped_garment(tmp_path):
