@@ -220,8 +220,8 @@ class Stage1Config:
     """Persistent simulations; `restart_probability: 1` with any pool is HOOD's restart curriculum."""
     restart_probability: float = 1.0 / 90.0
     lost: float | None = None
-    """A simulation whose loss is not below it is begun anew at its next turn, as are those of which a vertex is 5 m from
-    the body. Null: only these; an untrained Phi needs the time to mend its own."""
+    """A simulation whose loss is not below it is begun anew at its next turn, as are those of which a vertex is 5 m
+    from the body. Null: only these; an untrained Phi needs the time to mend its own."""
     rollout: int = 1
     """Frames of one update at the start ..."""
     rollout_end: int = 1
@@ -258,8 +258,8 @@ class TuningConfig(Stage1Config):
     steps: int = 0
     pool: int = 192
     lost: float | None = 100.0
-    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth that has gone into the body comes to 1e5, stays there, and draws
-    the others in."""
+    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth that has gone into the body comes to 1e5, stays there, and
+    draws the others in."""
     learning_rate: float = 1.5e-4
     clip: float = 20.0
     """Three times an ordinary gradient of a skirt, whose gradients of contact then count for more without drowning the

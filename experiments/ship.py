@@ -26,7 +26,7 @@ def main(argv: list[str]) -> None:
     folder, packed = trained.MODELS / arguments.name, arguments.run / "packed" / arguments.name
     size = trained.pack(arguments.run, packed)
     print(f"{packed}: {size / 1e6:.2f} MB of weights")
-    report = pretrained({arguments.name: packed})[arguments.name]
+    reports = pretrained({arguments.name: packed})
     config, _ = trained.phi(packed)
     seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
     seconds += sum(add_seconds(arguments.run).values())
@@ -36,11 +36,11 @@ def main(argv: list[str]) -> None:
         "seed": config.stage1.seed,
         "hours": seconds / 3600,
     }
-    (packed / "report.json").write_text(json.dumps(about | report, indent=1) + "\n")
+    (packed / "report.json").write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for path in packed.iterdir():
         shutil.copy(path, folder)
-    print(f"{table(report)}\nin {folder}")
+    print(f"{table(reports['mean'])}\nin {folder}")
 
 
 if __name__ == "__main__":
