@@ -272,7 +272,7 @@ def make_update(
             jax.tree.map(lambda x: jnp.mean(x, axis=0), gradients),  # over devices
             stage.ema,
         )
-        # it starts anew at its next turn; so does one whose update was skipped
+        # a lost simulation starts anew at its next turn; so does one whose update was skipped
         lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0)
         lost |= ~(each < (jnp.inf if stage.lost is None else stage.lost))
         advance = jnp.where(simulations.fresh, frames - 1, frames)

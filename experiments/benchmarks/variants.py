@@ -47,8 +47,8 @@ ALIKE = ("body", "fps", "physics", "material", "motions")  # of the configuratio
 class Variant(NamedTuple):
     """Something that moves a garment."""
 
-    family: str  # of COLOURS
-    runtime: str  # of MARKERS
+    family: str  # such as psi, ncs or solver
+    runtime: str  # onnx, c, jax or warp
     tracks: list[np.ndarray]  # closed loops [T - 2, V, 3] m over each of the clips, relative to the root
     call: Call | None  # one frame of it, to be timed beside the others
     us: float = 0.0  # a frame of the loop, where there is no `call`
