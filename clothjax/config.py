@@ -261,14 +261,14 @@ class TuningConfig(Stage1Config):
     """An ordinary loss is 1 (skirt) to 20 (dress). Cloth that has gone into the body comes to 1e5, stays there, and
     draws the others in."""
     learning_rate: float = 1.5e-4
-    clip: float = 20.0
-    """Three times an ordinary gradient of a skirt, whose gradients of contact then count for more without drowning the
-    others; those of a dress are larger, and nearly all of them clipped."""
+    clip: float = 1.5
+    """Less than nearly every gradient, so that simulations count alike: soft cloth, and cloth in the body."""
     start_timestep: float = 0.0
     preconditioning: float = 0.5
     """Power of Phi's inverse Hessian, where `model.latent_update` is `descent`, that gradients of codes are multiplied
-    by; 0: none. The cloth is up to 4 000 times stiffer along some codes, in standard deviations, than along others.
-    With 1, errors of all would count alike, which energies do not."""
+    by, and of the poses' inverse covariance in those of the first layer; 0: none. The cloth is up to 4 000 times stiffer
+    along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which energies
+    do not."""
 
     def __post_init__(self):
         super().__post_init__()

@@ -100,31 +100,6 @@ def predict(params: Params, latent: Array, pose: Array, constants: Array, decay:
     return (1.0 - decay) * latent + mlp(params, jnp.concatenate([latent, pose, constants]))
 
 
-def advance(
-    params: Params,
-    code: Array,
-    poses: Pose,
-    joints: Array,
-    constants: Array,
-    parents: np.ndarray,
-    kept: np.ndarray,
-    normalizers: Normalizers,
-    config: Config,
-) -> Array:
-    """The next code [L] in standard deviations, brought into its range as in use.
-
-    Args:
-        code: [L] as it is; poses: a window of three; joints: [J, 3] m, of the shaped body; constants: [C].
-
-    Gradients pass as if nothing had been out of range.
-    """
-    pose = window_inputs(poses, joints, parents, kept, config.fps)
-    now, pose = normalise(normalizers.latent, code), normalise(normalizers.pose, pose)
-    latent = predict(params, now, pose, constants, config.stage2.latent_decay)
-    inside, _ = bounded(latent, normalizers.latent.low, normalizers.latent.high)
-    return latent + jax.lax.stop_gradient(inside - latent)
-
-
 def identity(size: int) -> Scale:
     """The scale that leaves rows [N] as they are, whatever is in them."""
     far = np.full(size, 1e6, np.float32)

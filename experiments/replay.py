@@ -112,8 +112,8 @@ def _again(
     kept = latent_predictor.kept_joints(whole.names, config.stage2)
     if stage == "tuning":
         _, garment, predictor, normalizers = trained.psi(run)
-        inverse = trained.phi(run)[1]["params"].get("inverse_hessian")
-        animator = tuning.psi(garment, normalizers, kept, inverse, config.tuning.preconditioning)
+        phi = trained.phi(run)[1]["params"]
+        animator = tuning.psi(garment, normalizers, kept, tuning.preconditioners(whole, reel, phi, normalizers, kept))
         config = tuning.settings(config)
         state = tuning.init(predictor, whole.scene, reel, whole.config)
     elif config.peer.network:

@@ -206,13 +206,8 @@ def tune(
     """
     config = whole.config
     devices.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    psi = tuning.psi(
-        garment,
-        normalizers,
-        latent_predictor.kept_joints(whole.names, config.stage2),
-        phi.get("inverse_hessian"),
-        config.tuning.preconditioning,
-    )
+    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    psi = tuning.psi(garment, normalizers, kept, tuning.preconditioners(whole, reel, phi, normalizers, kept))
     return fit.fit(
         stage1.make_curriculum(whole.scene, reel, tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
         devices.replicate(tuning.init(predictor, whole.scene, reel, config), device_mesh),

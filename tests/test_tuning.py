@@ -82,7 +82,8 @@ def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
     cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), *(jnp.zeros(size) for _ in range(2)))
 
     def found(inverse):
-        make = tuning.psi(garment, normalizers, kept, inverse, 0.5)
+        code = None if inverse is None else tuning.code_preconditioner(inverse, normalizers, 0.5)
+        make = tuning.psi(garment, normalizers, kept, tuning.Preconditioners(jnp.eye(len(normalizers.pose.mean)), code))
 
         def energy(bias):
             params = predictor | {last: predictor[last] | {"bias": bias}}
@@ -94,7 +95,7 @@ def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
     (plain, code), gradient = found(None)
     (same, same_code), preconditioned = found(inverse)
     assert plain == same and (code == same_code).all()
-    expected = tuning.preconditioner(inverse, normalizers, 0.5) @ gradient
+    expected = tuning.code_preconditioner(inverse, normalizers, 0.5) @ gradient
     np.testing.assert_allclose(preconditioned, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
     assert float(jnp.abs(expected - gradient).max()) > 0.1 * float(jnp.abs(gradient).max())
 
@@ -113,15 +114,56 @@ def test_preconditioned_gradients_point_to_the_minimum():
         return 0.5 * apart @ jnp.asarray(stiffness, jnp.float32) @ apart
 
     def alignment(power):
-        matrix = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), power)
+        matrix = tuning.code_preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), power)
         assert energy(code, matrix) == energy(code)
         gradient, way = jax.grad(energy)(code, matrix), code - best
         return float(gradient @ way / jnp.linalg.norm(gradient) / jnp.linalg.norm(way))
 
     assert alignment(1.0) > 0.999
     assert alignment(0.0) < alignment(0.5) < alignment(1.0)
-    plain = tuning.preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
+    plain = tuning.code_preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
     np.testing.assert_allclose(plain, np.eye(6), atol=1e-5)
+
+
+def test_the_first_layer_learns_from_preconditioned_poses_and_predicts_from_poses(toy):
+    whole, reel, kept, garment, predictor, normalizers = toy
+    config, betas = whole.config, jnp.linspace(-1, 1, 10)
+    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
+    poses = motion.poses(reel, 5)
+    window = characters.window(whole.scene, character, poses)
+    size, count = len(normalizers.latent.mean), len(normalizers.pose.mean)
+    matrix = jnp.asarray(np.random.default_rng(0).normal(size=(count, count)), jnp.float32)
+    cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), *(jnp.zeros(size) for _ in range(2)))
+
+    def found(matrix):
+        gradients = None if matrix is None else tuning.Preconditioners(matrix, None)
+        make = tuning.psi(garment, normalizers, kept, gradients)
+
+        def energy(params):
+            new, code, _ = make({"params": params}, whole.scene, character, config)(cloth, poses, window, None, None)
+            return jnp.sum((new - 1.0) ** 2), code
+
+        return jax.jit(jax.value_and_grad(energy, has_aux=True))(predictor)
+
+    (plain, code), gradient = found(None)
+    (same, same_code), preconditioned = found(matrix)
+    assert plain == same and (code == same_code).all()
+    kernel, other = gradient.pop("dense_0")["kernel"], preconditioned.pop("dense_0")["kernel"]
+    jax.tree.map(np.testing.assert_array_equal, gradient, preconditioned)
+    rows = slice(size, size + count)
+    expected = kernel.at[rows].set(jnp.matmul(matrix, kernel[rows], precision="highest"))
+    np.testing.assert_allclose(other, expected, rtol=1e-3, atol=1e-4 * float(jnp.abs(expected).max()))
+
+
+def test_preconditioned_poses_tell_velocities_as_loudly_as_places():
+    rng = np.random.default_rng(0)
+    place, velocity = rng.normal(size=(2, 20_000))
+    poses = np.stack([place, place + 0.2 * velocity, rng.normal(size=20_000)], axis=1)
+    matrix = np.asarray(tuning.pose_preconditioner(poses, 0.5))
+    seen = poses @ matrix
+    covariance = np.cov(seen.T)
+    np.testing.assert_allclose(covariance, np.eye(3) * np.trace(np.cov(poses.T)) / 3, atol=0.1)
+    np.testing.assert_allclose(tuning.pose_preconditioner(poses, 0.0), np.eye(3), atol=1e-5)
 
 
 def test_tuning_has_the_last_loss_weights_and_the_bodies_of_stage_1():
