@@ -266,9 +266,9 @@ class TuningConfig(Stage1Config):
     start_timestep: float = 0.0
     preconditioning: float = 0.5
     """Power of Phi's inverse Hessian, where `model.latent_update` is `descent`, that gradients of codes are multiplied
-    by, and of the poses' inverse covariance in those of the first layer; 0: none. The cloth is up to 4 000 times stiffer
-    along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which energies
-    do not."""
+    by, and of the poses' inverse covariance in those of the first layer; 0: none. The cloth is up to 4 000 times
+    stiffer along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which
+    energies do not."""
 
     def __post_init__(self):
         super().__post_init__()
