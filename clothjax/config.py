@@ -257,9 +257,9 @@ class TuningConfig(Stage1Config):
 
     steps: int = 0
     pool: int = 192
-    lost: float | None = 100.0
-    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth that has gone into the body comes to 1e5, stays there, and
-    draws the others in."""
+    lost: float | None = 1e4
+    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth that has gone into the body may come to 1e5 and stay there;
+    that which can come out should be seen doing so."""
     learning_rate: float = 1.5e-4
     clip: float = 1.5
     """Less than nearly every gradient, so that simulations count alike: soft cloth, and cloth in the body."""
