@@ -322,7 +322,7 @@ def _skin(garment: Array, weights: Array, transforms: Array, translation: Array)
 
 
 @jax.jit
-def resting(before: State, after: State, tolerance: float = 1e-3) -> Array:
+def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
     """Whether a step has changed nothing, bool: until the pose changes, no other need be taken.
 
     Args:

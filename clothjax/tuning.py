@@ -100,9 +100,10 @@ def preconditioners(
     if power == 0:
         return None
     poses = stage2.ordinary_poses(experiment.scene, reel, kept, config)
+    poses = jax.vmap(latent_predictor.normalise, (None, 0))(normalizers.pose, poses)
     inverse = phi.get("inverse_hessian")
     return Preconditioners(
-        pose=pose_preconditioner(latent_predictor.normalise(normalizers.pose, poses), power),
+        pose=pose_preconditioner(poses, power),
         code=None if inverse is None else code_preconditioner(inverse, normalizers, power),
     )
 

@@ -150,9 +150,9 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
 @pytest.mark.slow
 def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solvers(finished):
     config = train.load_phi(finished)[0].config
-    settings = dataclasses.replace(config.evaluation, frames=9, betas=0.25)
+    settings = dataclasses.replace(config.evaluation, frames=14, solver_frames=20, betas=0.25)
     report = evaluate.evaluate(finished, ["twist_3"], settings)
-    assert report["motions"]["twist_3"]["solver"]["frames"] == 7 and np.abs(report["betas"]).max() <= 0.25
+    assert report["motions"]["twist_3"]["solver"]["frames"] == 12 and np.abs(report["betas"]).max() <= 0.25
 
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):

@@ -106,8 +106,9 @@ def test_a_garment_that_nobody_sees_goes_on(trained):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), seen, unseen)
 
 
-def test_a_garment_at_rest_can_be_left_alone():
-    model = inference.load("skirt")
+@pytest.mark.parametrize("name", ["dress", "pants", "skirt", "tshirt"])
+def test_a_garment_at_rest_can_be_left_alone(name):
+    model = inference.load(name)
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
     state = inference.initial_state(model, poses[0])
