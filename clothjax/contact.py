@@ -3,14 +3,14 @@
 import jax
 import jax.numpy as jnp
 
-from clothjax.proximity import Patches, closest_on_triangle, nearest_face, nearest_point
+from clothjax.proximity import Patches, closest_on_triangle, nearest_face, nearest_face_around, nearest_point
 from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
 LEVEL = 1e-4  # m, planes that differ by less are one
 
 
-def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> Contact:
+def find(positions: Array, body: Array, body_next: Array, patches: Patches, outward: Array | None = None) -> Contact:
     """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
 
     The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
@@ -19,11 +19,22 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> C
 
     Args:
         body, body_next: [B, 3] m at this frame and the next.
+        outward: [B, 3] directions that lead out of the body, as of `character.Frame`. In a bent hip or elbow skinning
+            turns skin inside out, and pseudonormals say of what is centimetres in front of it that it is inside: with
+            these it is inside only if they say so too.
     """
-    positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
-    faces = patches.faces
-    corners = body[faces]
-    face = nearest_face(positions, corners, patches.groups)
+    positions, body, body_next, patches, outward = jax.tree.map(
+        jnp.asarray, (positions, body, body_next, patches, outward)
+    )
+    face = nearest_face(positions, body[patches.faces], patches.groups)
+    return _planes(positions, face, body, body_next, patches, outward)
+
+
+def _planes(
+    positions: Array, face: Array, body: Array, body_next: Array, patches: Patches, outward: Array | None
+) -> Contact:
+    """As `find`, with the nearest triangles [V] known."""
+    faces, corners = patches.faces, body[patches.faces]
     here, there = corners[face], body_next[faces[face]]
     weights, _ = jax.lax.stop_gradient(closest_on_triangle(positions, here))
     point, point_next = (jnp.einsum("vk,vkc->vc", weights, x, precision="highest") for x in (here, there))
@@ -31,7 +42,12 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> C
     offset = positions - point
     apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
     pseudonormal, border = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
-    side = jnp.where(jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    inside = jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0
+    if outward is not None:
+        out = _unit(jnp.einsum("vk,vkc->vc", weights, outward[faces[face]], precision="highest"))
+        inside &= jnp.sum(offset * out, axis=-1, keepdims=True) < 0
+        pseudonormal = jnp.where(jnp.sum(pseudonormal * out, axis=-1, keepdims=True) < 0, out, pseudonormal)
+    side = jnp.where(inside, -1.0, 1.0)
     on_surface = (apart < ON_SURFACE**2) | border[:, None]
     normal = jnp.where(on_surface, pseudonormal, side * offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     local = jnp.einsum("vca,vc->va", _axes(here), normal, precision="highest")
@@ -42,13 +58,23 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> C
 
 
 def find_at_edges(
-    positions: Array, planes: Contact, mesh: Mesh, body: Array, body_next: Array, patches: Patches
+    positions: Array,
+    planes: Contact,
+    mesh: Mesh,
+    body: Array,
+    body_next: Array,
+    patches: Patches,
+    outward: Array | None = None,
 ) -> EdgeContact:
     """The contact of each edge where it comes nearest to the body between its ends, whose planes are `planes`.
 
     That place is where the planes of both ends are equally far: over a body's edge, which has one of the ends on
-    either side, the point of the garment's edge above it; over a flat part the middle.
+    either side, the point of the garment's edge above it; over a flat part the middle. What is nearest to it is sought
+    near what is nearest to the ends.
     """
+    positions, body, body_next, patches, outward = jax.tree.map(
+        jnp.asarray, (positions, body, body_next, patches, outward)
+    )
     a, b = mesh.edges[:, 0], mesh.edges[:, 1]
     start, end = positions[a], positions[b]
 
@@ -59,7 +85,9 @@ def find_at_edges(
 
     before, after = beyond(start, a, b), beyond(end, b, a)
     place = jax.lax.stop_gradient(before / (before + after))
-    found = find(start + place[:, None] * (end - start), body, body_next, patches)
+    between = start + place[:, None] * (end - start)
+    face = nearest_face_around(between, body, patches, [planes.index[end] for end in (a, b)])
+    found = _planes(between, face, body, body_next, patches, outward)
     return EdgeContact(place, found.point_next, found.normal_next)
 
 

@@ -13,6 +13,7 @@ BLOCK = 64  # points
 PATCH = 32  # triangles
 PASSES = 4  # of all positions, before only those without an answer are gone through
 CHUNK = 32  # of the positions, gone through together after that
+STRIDES = 2  # of a search along a surface
 LAST = jnp.iinfo(jnp.int32).max
 
 
@@ -23,6 +24,7 @@ class Patches(NamedTuple):
     across: Array  # [F, 3] int32, the face across the edge opposite a corner; itself where there is none
     border: Array  # [B] bool, vertices of an edge that only one face has
     groups: Array  # [G, PATCH] int32, every face; the last of a group is repeated
+    around: Array  # [B, R] int32, the faces that have a vertex; the last of a vertex is repeated
 
 
 def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
@@ -47,7 +49,15 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
 
     groups = np.stack(halve(np.arange(len(faces))))
     across = np.reshape(across, (-1, 3)).astype(np.int32)
-    return Patches(faces.astype(np.int32), across, border, groups.astype(np.int32))
+    return Patches(faces.astype(np.int32), across, border, groups.astype(np.int32), _around(faces, len(vertices)))
+
+
+def _around(faces: np.ndarray, count: int) -> np.ndarray:
+    order = np.argsort(faces.reshape(-1), kind="stable")
+    valence = np.bincount(faces.reshape(-1), minlength=count)
+    first = np.cumsum(valence) - valence
+    place = first[:, None] + np.minimum(np.arange(valence.max()), np.maximum(valence[:, None] - 1, 0))
+    return (order[np.minimum(place, faces.size - 1)] // 3).astype(np.int32)
 
 
 def nearest_point(positions: Array, points: Array) -> Array:
@@ -124,6 +134,38 @@ def _closest(b: Sequence[Array], c: Sequence[Array], p: Sequence[Array]) -> tupl
         better = squared < best
         v, w, best = jnp.where(better, side_v, v), jnp.where(better, side_w, w), jnp.where(better, squared, best)
     return v, w, best
+
+
+def nearest_face_around(positions: Array, body: Array, patches: Patches, vertices: Sequence[Array]) -> Array:
+    """Index [V] of the triangle of a mesh [B, 3] m nearest to each position [V, 3] m, sought from vertices near it.
+
+    The faces around these vertices (each [V] int32) are tried, then those around the corner nearest to the place that
+    was found, and so on for `STRIDES`: it walks along the surface, and does not see another limb. No gradient.
+    """
+    positions, body = jax.lax.stop_gradient((positions, body))
+    corners = body[patches.faces]
+    # the triangles around a vertex, one coordinate after the other: [B, 9, R]
+    table = jnp.transpose(corners[patches.around], (0, 2, 3, 1)).reshape(len(patches.around), 9, -1)
+
+    def nearest(vertex: Array) -> tuple[Array, Array]:
+        found = table[vertex]
+        origin = [found[:, i] for i in range(3)]
+        b, c = ([found[:, first + i] - origin[i] for i in range(3)] for first in (3, 6))
+        _, _, squared = _closest(b, c, [positions[:, i, None] - origin[i] for i in range(3)])
+        least = jnp.min(squared, axis=1)
+        place = jnp.min(jnp.where(squared == least[:, None], jnp.arange(squared.shape[1])[None], LAST), axis=1)
+        return patches.around[vertex, jnp.minimum(place, squared.shape[1] - 1)], least
+
+    def nearer(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+        return jax.tree.map(lambda x, y: jnp.where(other[1] < one[1], y, x), one, other)
+
+    first, *others = map(nearest, vertices)
+    for other in others:
+        first = nearer(first, other)
+    for _ in range(STRIDES):
+        weights, _ = closest_on_triangle(positions, corners[first[0]])
+        first = nearer(first, nearest(patches.faces[first[0], jnp.argmax(weights, axis=1)]))
+    return first[0]
 
 
 def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array | None = None) -> Array:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from clothjax import character as characters
 from clothjax import clips, contact, experiment, proximity, rollout, skinning, topology
@@ -154,6 +155,54 @@ def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     np.testing.assert_allclose(contact.distance(planes.point_next, advanced.point, advanced.normal), 0.0, atol=1e-5)
 
 
+def bent(beta, limit=-3.0):
+    """A stooping body: the part that a skirt can touch, and the whole (scene, frame, vertices, faces)."""
+    config = Config(garment="skirt_1000")
+    whole = experiment.assemble(config)
+    betas = jnp.zeros(10).at[beta].set(limit)
+    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
+    turns = {"LeftUpLeg": [-50, 6, 7], "RightUpLeg": [-50, -6, -7], "LowerBack": [30, 0, 0]}
+    rotations = np.tile(np.eye(3, dtype=np.float32), (len(whole.names), 1, 1))
+    for joint, degrees in turns.items():
+        rotations[whole.names.index(joint)] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
+    pose = Pose(jnp.asarray(rotations), jnp.zeros(3))
+    vertices = skinning.pose_body(
+        whole.body, skinning.shaped_vertices(whole.body, betas), skinning.shaped_joints(whole.body, betas), pose
+    )
+    return whole.scene, characters.frame(whole.scene, character, pose), vertices, whole.body.faces
+
+
+@pytest.mark.parametrize("beta", [1, 3])
+def test_nothing_is_inside_in_front_of_skin_that_is_folded_inside_out(beta):
+    """In the groin of a stooping body; by the winding number of the whole body, which does not ask what is nearest."""
+    scene, frame, vertices, faces = bent(beta)
+    random = np.random.default_rng(0)
+    hips = np.asarray(frame.body)[np.asarray(scene.body.weights)[:, 0] > 0.5]
+    places = hips[random.integers(0, len(hips), 10000)]
+    positions = (places + random.normal(0, 0.04, places.shape)).astype(np.float32)
+    winding = igl.fast_winding_number(
+        np.asarray(vertices, np.float64), np.asarray(faces, np.int64), positions.astype(np.float64)
+    )
+
+    def errors(outward):
+        found = contact.find(positions, frame.body, frame.body, scene.patches, outward)
+        distance = np.asarray(contact.distance(positions, found.point, found.normal))
+        deep = distance < -3e-3
+        return (deep & (winding < 0.5)).sum(), (deep & (winding > 0.5)).sum()
+
+    (wrong, right), (still_wrong, still_right) = errors(None), errors(frame.outward)
+    assert wrong > 40  # else this body has nothing folded
+    assert still_wrong <= 0.05 * wrong
+    assert still_right >= 0.97 * right > 4000
+
+
+def test_outward_leads_out_of_a_body_that_is_not_folded():
+    _, frame, vertices, faces = bent(0, limit=0.0)
+    ahead = np.asarray(frame.body + 2e-3 * frame.outward, np.float64)
+    winding = igl.fast_winding_number(np.asarray(vertices, np.float64), np.asarray(faces, np.int64), ahead)
+    assert (winding < 0.5).mean() > 0.95
+
+
 def limb(half_width=0.01):
     """A bar along z, 20 mm wide: (vertices, faces)."""
     corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -212,6 +261,33 @@ def test_a_flat_body_touches_an_edge_in_its_middle_also_where_they_are_parallel(
         np.testing.assert_allclose(found.place[edge], 0.5, atol=0.05)
         # 3e-8 m of rounding at 0.3 m, over 2 mm
         np.testing.assert_allclose(found.normal_next[edge], [0, 1, 0], atol=5e-5)
+
+
+def test_edges_of_a_garment_touch_what_is_nearest_to_them():
+    """Sought near the ends' contact, found as if the whole body had been gone through: where cloth is near a body."""
+    config = Config(garment="tshirt_1000")
+    whole = experiment.assemble(config)
+    scene, mesh = whole.scene, whole.scene.mesh
+    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
+    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "run_3")))
+    near = lost = 0
+    for frame in (20, 40, 60):
+        window = characters.window(scene, character, clips.poses(reel, jnp.int32(frame)))
+        body = window.current.body
+        positions = characters.skinned(character, window.current)
+        positions += 3e-3 * jax.random.normal(jax.random.key(frame), positions.shape)
+        planes = contact.find(positions, body, body, scene.patches, window.current.outward)
+        found = contact.find_at_edges(positions, planes, mesh, body, body, scene.patches, window.current.outward)
+        start, end = positions[mesh.edges[:, 0]], positions[mesh.edges[:, 1]]
+        between = start + found.place[:, None] * (end - start)
+        distance = contact.distance(between, found.point_next, found.normal_next)
+        expected = contact.find(between, body, body, scene.patches, window.current.outward)
+        expected = contact.distance(between, expected.point, expected.normal)
+        touching = np.abs(expected) < 0.02
+        near += touching.sum()
+        lost += (touching & (np.abs(distance - expected) > 1e-4)).sum()
+    assert near > 2000
+    assert lost <= 0.01 * near
 
 
 def test_an_edge_without_length_and_a_body_without_area_give_finite_contact():

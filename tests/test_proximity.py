@@ -138,3 +138,32 @@ def test_patches_hold_every_face_once_and_meet_across_edges():
             boundary += other == face
             assert edge <= set(patches.faces[other].tolist())
     assert boundary == 3
+
+
+def test_the_faces_around_a_vertex():
+    vertices, faces = icosphere(1)
+    vertices = np.concatenate([vertices, [[2.0, 0.0, 0.0]]])  # one that no face has
+    around = proximity.patches(vertices, faces).around
+    for vertex in range(len(vertices) - 1):
+        assert set(around[vertex]) == set(np.flatnonzero((faces == vertex).any(axis=1)))
+    assert ((around >= 0) & (around < len(faces))).all()
+
+
+def test_a_walk_along_a_sphere_ends_at_the_nearest_face():
+    """From vertices two rings of faces away from what is nearest."""
+    vertices, faces = icosphere(3)
+    vertices = vertices.astype(np.float32)
+    patches = proximity.patches(vertices, faces)
+    random = np.random.default_rng(0)
+    positions = random.normal(size=(500, 3))
+    positions *= random.uniform(0.9, 1.2, (500, 1)) / np.linalg.norm(positions, axis=1, keepdims=True)
+    positions = positions.astype(np.float32)
+    nearest = np.asarray(proximity.nearest_point(positions, vertices))
+
+    def neighbour(vertex):
+        return faces[patches.around[vertex, 0], random.integers(0, 3, len(vertex))]
+
+    starts = [neighbour(neighbour(nearest)) for _ in range(2)]
+    found = np.asarray(jax.jit(proximity.nearest_face_around)(positions, vertices, patches, starts))
+    distance = np.sqrt(proximity.closest_on_triangle(positions, vertices[faces[found]])[1])
+    np.testing.assert_allclose(distance, exact(positions, vertices[faces]), atol=1e-6)
