@@ -17,7 +17,7 @@ class Character(NamedTuple):
 
     template: Array  # [V, 3] m, the shaped garment in the canonical pose
     body: Array  # [B, 3] m, the shaped body within reach
-    normals: Array  # [B, 3] of it
+    outward: Array  # [B, 3] m, its normals, as long as it is thick below
     joints: Array  # [J, 3] m
     rest: Rest
     mass: Array  # [V] kg
@@ -30,7 +30,7 @@ class Frame(NamedTuple):
 
     garment: Array  # [V, 3, 4] skinning transforms of the garment's vertices
     body: Array  # [B, 3] m
-    outward: Array  # [B, 3] its normals of the canonical pose, as skinning turns them: they never turn inside out
+    outward: Array  # [B, 3] m, the character's as skinning turns them: unlike the skin, they never turn inside out
     root: Array  # [3] m, the root joint
     heading: Array  # [3, 3] of the root, about +Y
 
@@ -58,7 +58,7 @@ def dress(scene: Scene, betas: Array | None, material: Material, config: Physics
 
 
 def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Array, Rest, Array]:
-    """What the betas decide: template, body with its normals, joints, rest measures, and the areas [V] m^2 of the
+    """What the betas decide: template, body and ways out of it, joints, rest measures, and the areas [V] m^2 of the
     vertices, all weighted by the garment's cloth."""
     template = skinning.shaped_vertices(scene.garment, betas)
     body = skinning.shaped_vertices(scene.body, betas)
@@ -70,7 +70,7 @@ def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Ar
     return (
         template,
         body,
-        skinning.vertex_normals(body, scene.body.faces),
+        skinning.vertex_normals(body, scene.body.faces) * jnp.asarray(scene.thickness)[:, None],
         skinning.shaped_joints(scene.body, betas),
         rest,
         areas,
@@ -83,7 +83,7 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
     moved = skinning.blend(scene.body.weights, transforms)
     body = skinning.apply(moved, skinning.pose_corrected(scene.body, character.body, pose))
-    outward = jnp.einsum("nab,nb->na", moved[:, :, :3], character.normals, precision=skinning.HIGHEST)
+    outward = jnp.einsum("nab,nb->na", moved[:, :, :3], character.outward, precision=skinning.HIGHEST)
     root = int(np.flatnonzero(np.asarray(scene.body.parents) < 0)[0])
     return Frame(
         garment=skinning.blend(scene.garment.weights, transforms),

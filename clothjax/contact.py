@@ -19,9 +19,9 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches, outw
 
     Args:
         body, body_next: [B, 3] m at this frame and the next.
-        outward: [B, 3] directions that lead out of the body, as of `character.Frame`. In a bent hip or elbow skinning
-            turns skin inside out, and pseudonormals say of what is centimetres in front of it that it is inside: with
-            these it is inside only if they say so too.
+        outward: [B, 3] m, vectors that lead out of the body and are as long as it is thick, as of `character.Frame`. In
+            bent hips, knees and elbows skinning turns skin inside out, and pseudonormals say of what is centimetres in
+            front of it that it is inside. With these it is inside only if they say so too, and no deeper than that.
     """
     positions, body, body_next, patches, outward = jax.tree.map(
         jnp.asarray, (positions, body, body_next, patches, outward)
@@ -44,8 +44,10 @@ def _planes(
     pseudonormal, border = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
     inside = jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0
     if outward is not None:
-        out = _unit(jnp.einsum("vk,vkc->vc", weights, outward[faces[face]], precision="highest"))
+        ways = outward[faces[face]]
+        out = unit(jnp.einsum("vk,vkc->vc", weights, ways, precision="highest"))
         inside &= jnp.sum(offset * out, axis=-1, keepdims=True) < 0
+        inside &= apart < jnp.max(jnp.sum(ways * ways, axis=-1), axis=-1, keepdims=True)
         pseudonormal = jnp.where(jnp.sum(pseudonormal * out, axis=-1, keepdims=True) < 0, out, pseudonormal)
     side = jnp.where(inside, -1.0, 1.0)
     on_surface = (apart < ON_SURFACE**2) | border[:, None]
@@ -101,7 +103,7 @@ def find_on_self(positions: Array, patches: Patches) -> SelfContact:
     offset = positions - jnp.einsum("vk,vkc->vc", weights, here, precision="highest")
     apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
     on_surface = apart < ON_SURFACE**2
-    across = _unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
+    across = unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
     normal = jnp.where(on_surface, across, offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     return SelfContact(patches.faces[face], weights, jax.lax.stop_gradient(normal))
 
@@ -120,7 +122,7 @@ def find_at_centroids(positions: Array, body: Array, body_next: Array, faces: Ar
 def centroids(vertices: Array, faces: Array) -> tuple[Array, Array]:
     """Centroids [F, 3] m and unit normals [F, 3] of the faces of a body [B, 3] m."""
     corners = vertices[faces]
-    return jnp.mean(corners, axis=1), _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return jnp.mean(corners, axis=1), unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def distance(positions: Array, points: Array, normals: Array) -> Array:
@@ -130,7 +132,7 @@ def distance(positions: Array, points: Array, normals: Array) -> Array:
 
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
     """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on; if it is a border."""
-    normals = _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = patches.faces
     weighted = _angles(corners)[:, :, None] * normals[:, None]
     around = jnp.zeros_like(body).at[faces.reshape(-1)].add(weighted.reshape(-1, 3))
@@ -140,23 +142,24 @@ def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, we
     corner = faces[face, jnp.argmax(weights, axis=1)]
     border = jnp.where(count[:, 0] == 1, across == face, (count[:, 0] > 1) & patches.border[corner])
     edge = normals[face] + normals[across]
-    return _unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
+    return unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
 
 
 def _angles(corners: Array) -> Array:
     """Interior angles [F, 3] rad."""
-    sides = [_unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
+    sides = [unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
     cosines = [-jnp.sum(sides[k] * sides[k - 1], axis=-1) for k in range(3)]
     return jnp.arccos(jnp.clip(jnp.stack(cosines, axis=1), -1.0, 1.0))
 
 
 def _axes(corners: Array) -> Array:
     """Orthonormal axes [V, 3, 3], as columns, that go with triangles [V, 3, 3] m."""
-    along = _unit(corners[:, 1] - corners[:, 0])
-    normal = _unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
+    along = unit(corners[:, 1] - corners[:, 0])
+    normal = unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
     return jnp.stack([along, jnp.cross(normal, along), normal], axis=-1)
 
 
-def _unit(vectors: Array) -> Array:
+def unit(vectors: Array) -> Array:
+    """Vectors [..., 3] of length 1, zero where they are zero."""
     squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
     return jnp.where(squared > 0, vectors / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
