@@ -278,15 +278,13 @@ def test_a_flag_goes_all_the_way(tmp_path):
 def test_the_largest_balls_inside_a_bar_and_a_sphere():
     bar = trimesh.creation.box((0.2, 0.2, 1.0)).subdivide_to_size(0.015)
     radius = scene.ball_radius(bar.vertices, bar.faces)
-    aside = np.sort(np.abs(bar.vertices[:, :2]), axis=1)[
-        :, 0
-    ]  # from the middle line of a side: as far from a wall less
+    aside = np.sort(np.abs(bar.vertices[:, :2]), axis=1)[:, 0]  # nearer by this to another side
     middle = (np.abs(bar.vertices[:, 2]) < 0.3) & (aside < 0.06)
     np.testing.assert_allclose(radius[middle], 0.1 - aside[middle], atol=2e-3)
     ball = trimesh.creation.icosphere(4, 0.3)
     radius = scene.ball_radius(ball.vertices, ball.faces)
-    # a vertex's normal is off by a degree: then a neighbour is in the ball
-    assert radius.max() <= 0.3001 and radius.min() > 0.25 and np.median(radius) > 0.29
+    # where a vertex's normal is off by a degree, a neighbour is in the ball
+    assert radius.max() <= 0.3001 and radius.min() > 0.25
     assert scene.ball_radius(np.zeros((0, 3)), np.zeros((0, 3), int)).shape == (0,)
 
 
