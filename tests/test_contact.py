@@ -160,7 +160,7 @@ SQUATTING = {"LeftUpLeg": [-130, 0, -20], "RightUpLeg": [-130, 0, 20], "LeftLeg"
 
 
 def bent(turns, betas):
-    """A body: the part of it that a skirt can touch, and the whole (scene, frame, vertices, faces).
+    """A body in a skirt: (experiment, character, pose, vertices of the whole body).
 
     Args:
         turns: rotation vectors in degrees, of the joints that are turned.
@@ -174,41 +174,46 @@ def bent(turns, betas):
     for joint, degrees in turns.items():
         rotations[whole.names.index(joint)] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
     pose = Pose(jnp.asarray(rotations), jnp.zeros(3))
-    vertices = skinning.pose_body(
-        whole.body, skinning.shaped_vertices(whole.body, betas), skinning.shaped_joints(whole.body, betas), pose
-    )
-    return whole.scene, characters.frame(whole.scene, character, pose), vertices, whole.body.faces
+    vertices = skinning.pose_body(whole.body, skinning.shaped_vertices(whole.body, betas), character.joints, pose)
+    return whole, character, pose, np.asarray(vertices, np.float64)
+
+
+def winding(whole, vertices, positions):
+    """Winding numbers of a whole body about positions: 0 outside. They do not ask what is nearest."""
+    return igl.fast_winding_number(vertices, np.asarray(whole.body.faces, np.int64), np.asarray(positions, np.float64))
 
 
 @pytest.mark.parametrize("turns, betas", [(STOOPING, {1: -3.0}), (STOOPING, {3: -3.0}), (SQUATTING, {0: 3.0})])
 def test_nothing_is_inside_in_front_of_skin_that_is_folded_inside_out(turns, betas):
-    """In groin and knees; by the winding number of the whole body, which does not ask what is nearest."""
-    scene, frame, vertices, faces = bent(turns, betas)
-    random, body = np.random.default_rng(0), np.asarray(frame.body)
+    """In groin and knees, where pseudonormals alone are wrong."""
+    whole, character, pose, vertices = bent(turns, betas)
+    scene, config = whole.scene, whole.config
+    window = characters.window(scene, character, jax.tree.map(lambda x: jnp.stack([x] * 3), pose))
+    random, body = np.random.default_rng(0), np.asarray(window.current.body)
     hips_and_thighs = body[np.asarray(scene.body.joints)[np.asarray(scene.body.weights).argmax(axis=1), 1] > -0.4]
     places = hips_and_thighs[random.integers(0, len(hips_and_thighs), 10000)]
-    positions = (places + random.normal(0, 0.05, places.shape)).astype(np.float32)
-    winding = igl.fast_winding_number(
-        np.asarray(vertices, np.float64), np.asarray(faces, np.int64), positions.astype(np.float64)
-    )
+    positions = jnp.asarray(places + random.normal(0, 0.05, places.shape), jnp.float32)
+    outside = winding(whole, vertices, positions) < 0.5
 
-    def energies(outward):
-        found = contact.find(positions, frame.body, frame.body, scene.patches, outward)
+    def energies(found):
         distance = np.asarray(contact.distance(positions, found.point, found.normal))
         energy = 1e5 * np.maximum(-distance, 0) ** 3
-        return energy[winding < 0.5].sum(), (energy[winding > 0.5] > 0).mean()
+        return energy[outside].sum(), (energy[~outside] > 0).mean()
 
-    (wrong, right), (still_wrong, still_right) = energies(None), energies(frame.outward)
+    state = rollout.start(character, window, 0)._replace(position=positions)
+    step = rollout.time_step(scene, character, state, window, jnp.float32(1 / 30), config)
+    (wrong, right), (still_wrong, still_right) = map(
+        energies, (contact.find(positions, body, body, scene.patches), step.contact)
+    )
     assert wrong > 10.0  # J; else nothing is folded here
     assert still_wrong <= 0.02 * wrong
     assert still_right >= 0.95 * right
 
 
 def test_outward_leads_out_of_a_body_that_is_not_folded():
-    _, frame, vertices, faces = bent({}, {})
-    ahead = np.asarray(frame.body + 2e-3 * contact.unit(frame.outward), np.float64)
-    winding = igl.fast_winding_number(np.asarray(vertices, np.float64), np.asarray(faces, np.int64), ahead)
-    assert (winding < 0.5).mean() > 0.95
+    whole, character, pose, vertices = bent({}, {})
+    frame = characters.frame(whole.scene, character, pose)
+    assert (winding(whole, vertices, frame.body + 2e-3 * contact.unit(frame.outward)) < 0.5).mean() > 0.95
 
 
 def limb(half_width=0.01):
