@@ -20,8 +20,8 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches, outw
     Args:
         body, body_next: [B, 3] m at this frame and the next.
         outward: [B, 3] m, vectors that lead out of the body and are as long as it is thick, as of `character.Frame`. In
-            bent hips, knees and elbows skinning turns skin inside out, and pseudonormals say of what is centimetres in
-            front of it that it is inside. With these it is inside only if they say so too, and no deeper than that.
+            bent hips and knees skinning turns skin inside out, and pseudonormals say of what is centimetres in front of
+            it that it is inside. With these it is inside only if they say so too, and no deeper than that.
     """
     positions, body, body_next, patches, outward = jax.tree.map(
         jnp.asarray, (positions, body, body_next, patches, outward)

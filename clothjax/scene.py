@@ -12,8 +12,8 @@ from clothjax.proximity import Patches, patches
 from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
 
 NEAR = 0.05  # m, body beside the garment
-BALL_STEPS = 30  # of shrinking, at the most
 NEAR_SHARE = 0.05  # of a joint's vertices beside the garment, for the joint to matter
+BALL_STEPS = 30  # of shrinking, at the most
 
 
 class Table(NamedTuple):
@@ -115,12 +115,11 @@ def ball_radius(vertices: Array, faces: Array) -> np.ndarray:
     Nothing inside is farther from the surface than that of the place it is nearest to.
     """
     vertices = np.asarray(vertices, np.float64)
-    radius = np.full(len(vertices), np.inf)
     if len(vertices) == 0:
-        return radius.astype(np.float32)
+        return np.zeros(0, np.float32)
     inwards = -np.nan_to_num(igl.per_vertex_normals(vertices, np.asarray(faces, np.int64)))
     tree = cKDTree(vertices)
-    radius[:] = np.linalg.norm(np.ptp(vertices, axis=0))
+    radius = np.full(len(vertices), np.linalg.norm(np.ptp(vertices, axis=0)))
     for _ in range(BALL_STEPS):
         distance, other = tree.query(vertices + radius[:, None] * inwards)
         offset = vertices[other] - vertices

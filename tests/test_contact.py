@@ -208,6 +208,28 @@ def test_nothing_is_inside_in_front_of_skin_that_is_folded_inside_out(turns, bet
     assert wrong > 10.0  # J; else nothing is folded here
     assert still_wrong <= 0.02 * wrong
     assert still_right >= 0.95 * right
+    arguments = positions, step.contact, scene.mesh, body, body, scene.patches
+    at_edges = contact.find_at_edges(*arguments, window.current.outward)
+    np.testing.assert_allclose(step.edge_contact.normal_next, at_edges.normal_next, atol=1e-4)
+
+
+def test_inside_is_what_outward_says_too_and_no_deeper_than_it_is_long():
+    """A ball, said to be thick, thin, and turned inside out."""
+    vertices, faces = icosphere(3)
+    vertices = vertices.astype(np.float32)
+    patches = proximity.patches(vertices, faces)
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+
+    def distance(radius, outward):
+        found = contact.find(radius * directions, vertices, vertices, patches, outward)
+        return np.asarray(contact.distance(radius * directions, found.point, found.normal))
+
+    assert (distance(0.97, vertices) < 0).all() and (distance(0.8, vertices) < 0).all()
+    assert (distance(0.97, 0.05 * vertices) < 0).all() and (distance(0.8, 0.05 * vertices) > 0).all()
+    assert (distance(0.97, -vertices) > 0).all()
+    on_surface = contact.find(vertices, vertices, vertices, patches, -vertices)
+    assert (np.sum(np.asarray(on_surface.normal) * vertices, axis=1) < -0.9).all()
 
 
 def test_outward_leads_out_of_a_body_that_is_not_folded():
