@@ -17,7 +17,6 @@ class Character(NamedTuple):
 
     template: Array  # [V, 3] m, the shaped garment in the canonical pose
     body: Array  # [B, 3] m, the shaped body within reach
-    outward: Array  # [B, 3] m, its normals, as long as it is thick below
     joints: Array  # [J, 3] m
     rest: Rest
     mass: Array  # [V] kg
@@ -30,7 +29,7 @@ class Frame(NamedTuple):
 
     garment: Array  # [V, 3, 4] skinning transforms of the garment's vertices
     body: Array  # [B, 3] m
-    outward: Array  # [B, 3] m, the character's as skinning turns them: unlike the skin, they never turn inside out
+    normals: Array  # [B, 3]
     root: Array  # [3] m, the root joint
     heading: Array  # [3, 3] of the root, about +Y
 
@@ -57,11 +56,10 @@ def dress(scene: Scene, betas: Array | None, material: Material, config: Physics
     return Character(*shape, mass=areas * material.density, material=material, betas=betas)
 
 
-def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Array, Rest, Array]:
-    """What the betas decide: template, body and ways out of it, joints, rest measures, and the areas [V] m^2 of the
-    vertices, all weighted by the garment's cloth."""
+def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Rest, Array]:
+    """What the betas decide: template, body, joints, rest measures, and the areas [V] m^2 of the vertices, all
+    weighted by the garment's cloth."""
     template = skinning.shaped_vertices(scene.garment, betas)
-    body = skinning.shaped_vertices(scene.body, betas)
     measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
     rest = physics.rest_measures(measured, scene.mesh, flat=config.flat_hinges)
     areas = physics.vertex_areas(measured, scene.garment.faces)
@@ -69,8 +67,7 @@ def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Ar
         rest, areas = physics.regional(rest, areas, scene.mesh, jnp.asarray(scene.garment.cloth))
     return (
         template,
-        body,
-        skinning.vertex_normals(body, scene.body.faces) * jnp.asarray(scene.thickness)[:, None],
+        skinning.shaped_vertices(scene.body, betas),
         skinning.shaped_joints(scene.body, betas),
         rest,
         areas,
@@ -81,14 +78,16 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
     """The character at a pose whose translation [3] m is relative to the root's at the current frame."""
     transforms = skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents)
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
-    moved = skinning.blend(scene.body.weights, transforms)
-    body = skinning.apply(moved, skinning.pose_corrected(scene.body, character.body, pose))
-    outward = jnp.einsum("nab,nb->na", moved[:, :, :3], character.outward, precision=skinning.HIGHEST)
+    body = skinning.apply(
+        skinning.blend(scene.body.weights, transforms),
+        skinning.pose_corrected(scene.body, character.body, pose),
+    )
+    normals = skinning.vertex_normals(body, scene.body.faces)
     root = int(np.flatnonzero(np.asarray(scene.body.parents) < 0)[0])
     return Frame(
         garment=skinning.blend(scene.garment.weights, transforms),
         body=body,
-        outward=outward,
+        normals=normals,
         root=character.joints[root] + pose.translation,
         heading=rotation.heading(pose.rotations[root]),
     )

@@ -70,7 +70,7 @@ class PhysicsConfig:
     self_contact: bool = False
     """Vertices of the garment keep away from its triangles."""
     self_offset: float = 2e-3  # m, the distance that they keep
-    reach: float = 0.35  # m, body farther than this from the garment at rest is never searched
+    reach: float = 0.6  # m, body farther than this from the garment at rest is never searched
 
     def __post_init__(self):
         _require(

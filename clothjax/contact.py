@@ -3,36 +3,39 @@
 import jax
 import jax.numpy as jnp
 
-from clothjax.proximity import Patches, closest_on_triangle, nearest_face, nearest_face_around, nearest_point
+from clothjax.proximity import (
+    Patches,
+    closest_on_triangle,
+    nearest_face,
+    nearest_face_around,
+    nearest_point,
+    winding_number,
+)
 from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
+DEEP = 0.7  # of a triangle's size, the root of its area: farther in than this the winding number has to agree
+WOUND = 0.25  # the least of it that does: it is 0 outside, 1 inside, and half of that behind an open sheet
 LEVEL = 1e-4  # m, planes that differ by less are one
 
 
-def find(positions: Array, body: Array, body_next: Array, patches: Patches, outward: Array | None = None) -> Contact:
+def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> Contact:
     """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
 
     The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
-    2005). Where the body ends, as where it was cut, the surface is taken to go on. Plane and point go with their
-    triangle to the next frame.
+    2005). Skinning turns skin inside out in bent hips and knees, and pushes it through to the other side: these then
+    say of what is centimetres in front of a body that it is in it. So inside and deep, by the size of the triangle, is
+    only what the body also winds around. Where the body ends, as where it was cut, the surface is taken to go on as far
+    as that. Plane and point go with their triangle to the next frame.
 
     Args:
         body, body_next: [B, 3] m at this frame and the next.
-        outward: [B, 3] m, vectors that lead out of the body and are as long as it is thick, as of `character.Frame`. In
-            bent hips and knees skinning turns skin inside out, and pseudonormals say of what is centimetres in front of
-            it that it is inside. With these it is inside only if they say so too, and no deeper than that.
     """
-    positions, body, body_next, patches, outward = jax.tree.map(
-        jnp.asarray, (positions, body, body_next, patches, outward)
-    )
-    face = nearest_face(positions, body[patches.faces], patches.groups)
-    return _planes(positions, face, body, body_next, patches, outward)
+    positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
+    return _planes(positions, nearest_face(positions, body[patches.faces], patches.groups), body, body_next, patches)
 
 
-def _planes(
-    positions: Array, face: Array, body: Array, body_next: Array, patches: Patches, outward: Array | None
-) -> Contact:
+def _planes(positions: Array, face: Array, body: Array, body_next: Array, patches: Patches) -> Contact:
     """As `find`, with the nearest triangles [V] known."""
     faces, corners = patches.faces, body[patches.faces]
     here, there = corners[face], body_next[faces[face]]
@@ -43,14 +46,10 @@ def _planes(
     apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
     pseudonormal, border = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
     inside = jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0
-    if outward is not None:
-        ways = outward[faces[face]]
-        out = unit(jnp.einsum("vk,vkc->vc", weights, ways, precision="highest"))
-        inside &= jnp.sum(offset * out, axis=-1, keepdims=True) < 0
-        inside &= apart < jnp.max(jnp.sum(ways * ways, axis=-1), axis=-1, keepdims=True)
-        pseudonormal = jnp.where(jnp.sum(pseudonormal * out, axis=-1, keepdims=True) < 0, out, pseudonormal)
+    deep = apart > DEEP**2 * jax.lax.stop_gradient(_areas(here))[:, None]
+    inside &= ~deep | (winding_number(positions, corners, patches.groups)[:, None] > WOUND)
     side = jnp.where(inside, -1.0, 1.0)
-    on_surface = (apart < ON_SURFACE**2) | border[:, None]
+    on_surface = (apart < ON_SURFACE**2) | (border[:, None] & ~deep)
     normal = jnp.where(on_surface, pseudonormal, side * offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     local = jnp.einsum("vca,vc->va", _axes(here), normal, precision="highest")
     turned = jnp.einsum("vca,va->vc", _axes(there), local, precision="highest")
@@ -60,13 +59,7 @@ def _planes(
 
 
 def find_at_edges(
-    positions: Array,
-    planes: Contact,
-    mesh: Mesh,
-    body: Array,
-    body_next: Array,
-    patches: Patches,
-    outward: Array | None = None,
+    positions: Array, planes: Contact, mesh: Mesh, body: Array, body_next: Array, patches: Patches
 ) -> EdgeContact:
     """The contact of each edge where it comes nearest to the body between its ends, whose planes are `planes`.
 
@@ -74,9 +67,7 @@ def find_at_edges(
     either side, the point of the garment's edge above it; over a flat part the middle. What is nearest to it is sought
     near what is nearest to the ends.
     """
-    positions, body, body_next, patches, outward = jax.tree.map(
-        jnp.asarray, (positions, body, body_next, patches, outward)
-    )
+    positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
     a, b = mesh.edges[:, 0], mesh.edges[:, 1]
     start, end = positions[a], positions[b]
 
@@ -89,7 +80,7 @@ def find_at_edges(
     place = jax.lax.stop_gradient(before / (before + after))
     between = start + place[:, None] * (end - start)
     face = nearest_face_around(between, body, patches, [planes.index[end] for end in (a, b)])
-    found = _planes(between, face, body, body_next, patches, outward)
+    found = _planes(between, face, body, body_next, patches)
     return EdgeContact(place, found.point_next, found.normal_next)
 
 
@@ -103,7 +94,7 @@ def find_on_self(positions: Array, patches: Patches) -> SelfContact:
     offset = positions - jnp.einsum("vk,vkc->vc", weights, here, precision="highest")
     apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
     on_surface = apart < ON_SURFACE**2
-    across = unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
+    across = _unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
     normal = jnp.where(on_surface, across, offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     return SelfContact(patches.faces[face], weights, jax.lax.stop_gradient(normal))
 
@@ -122,7 +113,7 @@ def find_at_centroids(positions: Array, body: Array, body_next: Array, faces: Ar
 def centroids(vertices: Array, faces: Array) -> tuple[Array, Array]:
     """Centroids [F, 3] m and unit normals [F, 3] of the faces of a body [B, 3] m."""
     corners = vertices[faces]
-    return jnp.mean(corners, axis=1), unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return jnp.mean(corners, axis=1), _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def distance(positions: Array, points: Array, normals: Array) -> Array:
@@ -132,7 +123,7 @@ def distance(positions: Array, points: Array, normals: Array) -> Array:
 
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
     """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on; if it is a border."""
-    normals = unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = patches.faces
     weighted = _angles(corners)[:, :, None] * normals[:, None]
     around = jnp.zeros_like(body).at[faces.reshape(-1)].add(weighted.reshape(-1, 3))
@@ -142,24 +133,29 @@ def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, we
     corner = faces[face, jnp.argmax(weights, axis=1)]
     border = jnp.where(count[:, 0] == 1, across == face, (count[:, 0] > 1) & patches.border[corner])
     edge = normals[face] + normals[across]
-    return unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
+    return _unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
+
+
+def _areas(corners: Array) -> Array:
+    """Areas [V] m^2 of triangles [V, 3, 3] m."""
+    across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * jnp.sqrt(jnp.sum(across * across, axis=-1))
 
 
 def _angles(corners: Array) -> Array:
     """Interior angles [F, 3] rad."""
-    sides = [unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
+    sides = [_unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
     cosines = [-jnp.sum(sides[k] * sides[k - 1], axis=-1) for k in range(3)]
     return jnp.arccos(jnp.clip(jnp.stack(cosines, axis=1), -1.0, 1.0))
 
 
 def _axes(corners: Array) -> Array:
     """Orthonormal axes [V, 3, 3], as columns, that go with triangles [V, 3, 3] m."""
-    along = unit(corners[:, 1] - corners[:, 0])
-    normal = unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
+    along = _unit(corners[:, 1] - corners[:, 0])
+    normal = _unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
     return jnp.stack([along, jnp.cross(normal, along), normal], axis=-1)
 
 
-def unit(vectors: Array) -> Array:
-    """Vectors [..., 3] of length 1, zero where they are zero."""
+def _unit(vectors: Array) -> Array:
     squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
     return jnp.where(squared > 0, vectors / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

@@ -100,7 +100,7 @@ def _world(
     """Of the body, as the garment's: `node` makes rows, which get `extra` columns of zeros."""
     bodies = [frame.body for frame in window]
     before, now, following = bodies
-    normals, nearest, slots = contacts.unit(window.current.outward), contact.index, contact.index
+    normals, nearest, slots = window.current.normals, contact.index, contact.index
     if len(now) > len(nearest):  # the distinct ones, in slots
         vertices, slots = jnp.unique(nearest, size=len(nearest), fill_value=0, return_inverse=True)
         slots = slots.astype(jnp.int32).reshape(-1)

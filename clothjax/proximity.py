@@ -11,6 +11,8 @@ from clothjax.types import Array
 
 BLOCK = 64  # points
 PATCH = 32  # triangles
+PART = 8  # triangles of a patch, which one dipole stands for
+SPREAD = 0.1  # of a part's area, the square of the length by which its dipole is spread
 PASSES = 4  # of all positions, before only those without an answer are gone through
 CHUNK = 32  # of the positions, gone through together after that
 STRIDES = 2  # of a search along a surface
@@ -23,7 +25,7 @@ class Patches(NamedTuple):
     faces: Array  # [F, 3] int32
     across: Array  # [F, 3] int32, the face across the edge opposite a corner; itself where there is none
     border: Array  # [B] bool, vertices of an edge that only one face has
-    groups: Array  # [G, PATCH] int32, every face; the last of a group is repeated
+    groups: Array  # [G, PATCH] int32, every face; the last of a group is repeated. Each PART of it is of neighbours
     around: Array  # [B, R] int32, the faces that have a vertex; the last of a vertex is repeated
 
 
@@ -39,15 +41,17 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
     border[np.concatenate([start[open_edge], end[open_edge]])] = True
     centroids = np.asarray(vertices)[faces].mean(axis=1)
 
-    def halve(members: np.ndarray) -> list[np.ndarray]:
-        if len(members) <= PATCH:
-            return [np.pad(members, (0, PATCH - len(members)), mode="edge")]
+    def halve(members: np.ndarray, size: int) -> list[np.ndarray]:
+        if len(members) <= size:
+            return [members]
         axis = np.ptp(centroids[members], axis=0).argmax()
         ordered = members[np.argsort(centroids[members, axis], kind="stable")]
-        half = PATCH * -(-len(members) // (2 * PATCH))
-        return halve(ordered[:half]) + halve(ordered[half:])
+        half = size * -(-len(members) // (2 * size))
+        return halve(ordered[:half], size) + halve(ordered[half:], size)
 
-    groups = np.stack(halve(np.arange(len(faces))))
+    # the same halves at every level, so that each PART of a patch is of neighbours too
+    parts = [np.concatenate(halve(patch, PART)) for patch in halve(np.arange(len(faces)), PATCH)]
+    groups = np.stack([np.pad(patch, (0, PATCH - len(patch)), mode="edge") for patch in parts])
     across = np.reshape(across, (-1, 3)).astype(np.int32)
     return Patches(faces.astype(np.int32), across, border, groups.astype(np.int32), _around(faces, len(vertices)))
 
@@ -58,6 +62,32 @@ def _around(faces: np.ndarray, count: int) -> np.ndarray:
     first = np.cumsum(valence) - valence
     place = first[:, None] + np.minimum(np.arange(valence.max()), np.maximum(valence[:, None] - 1, 0))
     return (order[np.minimum(place, faces.size - 1)] // 3).astype(np.int32)
+
+
+def winding_number(positions: Array, corners: Array, groups: Array) -> Array:
+    """Winding number [V] of triangles [F, 3, 3] m about positions [V, 3] m: 1 inside a closed mesh, 0 outside.
+
+    For each part of a patch stands a dipole, the first order of Barill et al. (2018), spread so that it has no pole:
+    farther from the mesh than parts are large this is the winding number; nearer, at least on which side of 0.25 it is.
+    No gradient.
+
+    Args:
+        groups: [G, PATCH] of `patches`.
+    """
+    positions, corners, groups = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, corners, groups)))
+    members = groups.reshape(-1)
+    again = jnp.concatenate([jnp.zeros(1, bool), members[1:] == members[:-1]])  # what fills a group up
+    area = 0.5 * jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = jnp.where(again[:, None], 0.0, area[members]).reshape(-1, PART, 3)
+    size = jnp.sqrt(jnp.sum(area * area, axis=-1, keepdims=True))
+    moment = jnp.sum(size * jnp.mean(corners, axis=1)[members].reshape(-1, PART, 3), axis=1)
+    size, dipole = jnp.sum(size, axis=1), jnp.sum(area, axis=1)
+    centre = moment / jnp.maximum(size, 1e-30)
+    # one coordinate after the other, so that it fuses
+    offset = [centre[None, :, i] - positions[:, None, i] for i in range(3)]
+    along = sum(offset[i] * dipole[None, :, i] for i in range(3))
+    squared = jnp.maximum(sum(x * x for x in offset) + SPREAD * size[None, :, 0], 1e-30)
+    return jnp.sum(along / (squared * jnp.sqrt(squared)), axis=1) / (4.0 * jnp.pi)
 
 
 def nearest_point(positions: Array, points: Array) -> Array:

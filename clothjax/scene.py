@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -13,7 +12,6 @@ from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
 
 NEAR = 0.05  # m, body beside the garment
 NEAR_SHARE = 0.05  # of a joint's vertices beside the garment, for the joint to matter
-BALL_STEPS = 30  # of shrinking, at the most
 
 
 class Table(NamedTuple):
@@ -34,7 +32,6 @@ class Scene(NamedTuple):
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]
     patches: Patches | None  # of the body
-    thickness: Array  # [B] m, of the body below its skin, as of `ball_radius`
     garment_patches: Patches
 
     @property
@@ -75,7 +72,6 @@ def build(garment: Garment, body: Body, config: Config) -> Scene:
         level=graph_sampling.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
         patches=patches(within.vertices, within.faces) if touchable else None,
-        thickness=ball_radius(within.vertices, within.faces),
         garment_patches=patches(garment.vertices, faces),
     )
 
@@ -107,28 +103,6 @@ def reachable(body: Body, garment: Garment, reach: float) -> Body:
     renumbered = np.full(len(inside), -1, np.int32)
     renumbered[kept] = np.arange(len(kept), dtype=np.int32)
     return _part(body, kept, renumbered[kept_faces])
-
-
-def ball_radius(vertices: Array, faces: Array) -> np.ndarray:
-    """Radii [B] m of the largest balls inside a mesh [B, 3] m that touch it at its vertices (Ma et al. 2012).
-
-    Nothing inside is farther from the surface than that of the place it is nearest to.
-    """
-    vertices = np.asarray(vertices, np.float64)
-    if len(vertices) == 0:
-        return np.zeros(0, np.float32)
-    inwards = -np.nan_to_num(igl.per_vertex_normals(vertices, np.asarray(faces, np.int64)))
-    tree = cKDTree(vertices)
-    radius = np.full(len(vertices), np.linalg.norm(np.ptp(vertices, axis=0)))
-    for _ in range(BALL_STEPS):
-        distance, other = tree.query(vertices + radius[:, None] * inwards)
-        offset = vertices[other] - vertices
-        depth = np.sum(offset * inwards, axis=1)
-        smaller = (distance < (1 - 1e-6) * radius) & (depth > 0)
-        if not smaller.any():
-            break
-        radius[smaller] = 0.5 * np.sum(offset**2, axis=1)[smaller] / depth[smaller]
-    return radius.astype(np.float32)
 
 
 def _bare(body: Body) -> Body:

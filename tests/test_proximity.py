@@ -25,6 +25,35 @@ def test_nearest_is_that_of_brute_force(origin):
     np.testing.assert_allclose(chosen**2, distances.min(axis=1) ** 2, atol=5e-7)
 
 
+@pytest.mark.parametrize("rounds, near", [(4, 0.1), (3, 0.2), (2, 0.5)])
+def test_winding_numbers_are_those_of_libigl(rounds, near):
+    """Of a dented ball of few or many triangles, in places farther from it than a part of a patch is large."""
+    random = np.random.default_rng(0)
+    vertices, faces = icosphere(rounds)
+    vertices *= 1.0 - 0.2 * np.abs(vertices[:, :1]) ** 3
+    positions = random.uniform(-1.6, 1.6, (4000, 3))
+    apart = np.sqrt(igl.point_mesh_squared_distance(positions, vertices, faces.astype(np.int64))[0])
+    positions = positions[apart > near]
+    patches = proximity.patches(vertices, faces)
+    shift = np.float32([3.0, -2.0, 1.0])
+    found = jax.jit(proximity.winding_number)(
+        (positions + shift).astype(np.float32), (vertices + shift).astype(np.float32)[faces], patches.groups
+    )
+    expected = igl.fast_winding_number(vertices, faces.astype(np.int64), positions)
+    np.testing.assert_allclose(found, expected, atol=0.15)
+    inside = expected > 0.5
+    assert np.array_equal(np.asarray(found) > 0.25, inside)
+    assert inside.sum() > 30 and (~inside).sum() > 100
+    open_ball = faces[:-37]  # of which no patch has a round number
+    found = proximity.winding_number(
+        positions.astype(np.float32),
+        vertices.astype(np.float32)[open_ball],
+        proximity.patches(vertices, open_ball).groups,
+    )
+    expected = igl.fast_winding_number(vertices, open_ball.astype(np.int64), positions)
+    np.testing.assert_allclose(found, expected, atol=0.15)
+
+
 def test_nearest_takes_the_first_of_equals():
     points = np.array([[1, 0, 0], [-1, 0, 0], [-1, 0, 0], [1, 0, 0]], np.float32)
     positions = np.array([[0, 0, 0], [-2, 0, 0], [2, 0, 0]], np.float32)

@@ -2,12 +2,10 @@
 
 import dataclasses
 
-import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 from toy import small
 
 from clothjax import blendshapes, clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
@@ -273,29 +271,3 @@ def test_a_flag_goes_all_the_way(tmp_path):
     assert np.isfinite(vertices).all()
     onnx = to_onnx(model, tmp_path / "flag.onnx")
     np.testing.assert_allclose(run_onnx(onnx, model, clip), inference.animate(model, clip)[0], atol=1e-4)
-
-
-def test_the_largest_balls_inside_a_bar_and_a_sphere():
-    bar = trimesh.creation.box((0.2, 0.2, 1.0)).subdivide_to_size(0.015)
-    radius = scene.ball_radius(bar.vertices, bar.faces)
-    aside = np.sort(np.abs(bar.vertices[:, :2]), axis=1)[:, 0]  # nearer by this to another side
-    middle = (np.abs(bar.vertices[:, 2]) < 0.3) & (aside < 0.06)
-    np.testing.assert_allclose(radius[middle], 0.1 - aside[middle], atol=2e-3)
-    ball = trimesh.creation.icosphere(4, 0.3)
-    radius = scene.ball_radius(ball.vertices, ball.faces)
-    # where a vertex's normal is off by a degree, a neighbour is in the ball
-    assert radius.max() <= 0.3001 and radius.min() > 0.25
-    assert scene.ball_radius(np.zeros((0, 3)), np.zeros((0, 3), int)).shape == (0,)
-
-
-def test_the_ball_inside_a_body_is_the_least_over_all_its_vertices(whole):
-    """Against the closed form of a ball through two points, over all pairs."""
-    vertices, faces = np.asarray(whole.scene.body.vertices, np.float64), np.asarray(whole.scene.body.faces)
-    normals = igl.per_vertex_normals(vertices, faces.astype(np.int64))
-    radius = scene.ball_radius(vertices, faces)
-    for vertex in range(0, len(vertices), 40):
-        offset = vertices - vertices[vertex]
-        depth = -offset @ normals[vertex]
-        below = depth > 1e-9
-        expected = (0.5 * (offset[below] ** 2).sum(axis=1) / depth[below]).min()
-        np.testing.assert_allclose(radius[vertex], expected, rtol=1e-3)
