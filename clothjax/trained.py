@@ -1,9 +1,11 @@
 """What training left: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
-A packed model is a folder with `model.npz` and `config.yaml`. Large matrices are kept in eight bits with a scale for
-each column (`NAME` and `NAME|scale`), the blend shapes and the preconditioner in half precision, all else as it is.
+A packed model is a folder with `model.npz` and `config.yaml`, and `report.json` where that says how it was made. Large
+matrices are kept in eight bits with a scale for each column (`NAME` and `NAME|scale`), the blend shapes and the
+preconditioner in half precision, all else as it is.
 """
 
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from clothjax.latent_predictor import Normalizers, Scale, identity
 from clothjax.types import Material
 
 MODELS = storage.ASSETS / "models"
-WEIGHTS, CONFIG = "model.npz", "config.yaml"
+WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
 LARGE = 2000  # entries of a matrix that is worth eight bits
@@ -106,6 +108,13 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
 def packed(run: str | Path) -> bool:
     """Whether a folder is a packed model."""
     return (Path(run) / WEIGHTS).is_file()
+
+
+def made(packed: str | Path) -> dict[str, Any]:
+    """How a packed model was made, as its report says: the `command`, `seed` and `hours` that are known."""
+    path = Path(packed) / REPORT
+    report = json.loads(path.read_text()) if path.is_file() else {}
+    return {name: report[name] for name in ("command", "seed", "hours") if name in report}
 
 
 def pack(run: str | Path, out: str | Path) -> int:

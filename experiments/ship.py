@@ -3,7 +3,7 @@
     python -m experiments.ship runs/skirt skirt
 
 It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
-the validation motions, with the command that trained it and its hours.
+the validation motions, with the command that trained it and its hours. What `experiments.tune` left is packed already.
 """
 
 import argparse
@@ -20,26 +20,29 @@ from experiments.session import fail_clearly, setup
 
 def main(argv: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("run", type=Path, help="folder of a finished run, or what experiments.tune left")
     parser.add_argument("name", help="of the garment")
     arguments = parser.parse_args(argv)
-    folder, packed = trained.MODELS / arguments.name, arguments.run / "packed" / arguments.name
-    size = trained.pack(arguments.run, packed)
-    print(f"{packed}: {size / 1e6:.2f} MB of weights")
+    run, folder = arguments.run, trained.MODELS / arguments.name
+    if trained.packed(run):
+        packed, about = run, trained.made(run)
+    else:
+        packed = run / "packed" / arguments.name
+        size = trained.pack(run, packed)
+        print(f"{packed}: {size / 1e6:.2f} MB of weights")
+        config, _ = trained.phi(packed)
+        seconds = sum(sum(read_seconds(run / stage)) for stage in trained.STAGES) + sum(add_seconds(run).values())
+        about = {
+            # the configuration is whole: it trains the same again
+            "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
+            "seed": config.stage1.seed,
+            "hours": seconds / 3600,
+        }
     reports = pretrained({arguments.name: packed})
-    config, _ = trained.phi(packed)
-    seconds = sum(sum(read_seconds(arguments.run / stage)) for stage in trained.STAGES)
-    seconds += sum(add_seconds(arguments.run).values())
-    about = {
-        # the configuration is whole: it trains the same again
-        "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
-        "seed": config.stage1.seed,
-        "hours": seconds / 3600,
-    }
-    (packed / "report.json").write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
+    (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
-    for path in packed.iterdir():
-        shutil.copy(path, folder)
+    for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT):
+        shutil.copy(packed / name, folder)
     print(f"{table(reports['mean'])}\nin {folder}")
 
 

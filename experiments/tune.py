@@ -3,10 +3,13 @@
     python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000
 
 Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
-garment, for `clothjax.load` and all programs that take a run, and `tuning/`. Run again, it goes on where it stopped.
+garment, for `clothjax.load` and all programs that take a run, with how it was made in report.json, and `tuning/`. Run
+again, it goes on where it stopped.
 """
 
 import argparse
+import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -36,6 +39,11 @@ def main(argv: list[str]) -> None:
     normalizers = normalizers._replace(pose=latent_predictor.widened(normalizers.pose, seen))
     tuned = tune(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
+    made = trained.made(folder)
+    command = shlex.join(["python", "-m", "experiments.tune", *argv])
+    made["command"] = f"{made['command']} && {command}" if "command" in made else command
+    made["hours"] = made.get("hours", 0.0) + (tuned.seconds + tuned.compile_seconds) / 3600
+    (given.out / trained.REPORT).write_text(json.dumps(made, indent=1) + "\n")
     print(f"{given.out}: {size / 1e6:.2f} MB of weights")
 
 

@@ -130,7 +130,13 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     trained.pack(finished, tmp_path / "packed")
     settings = ["--motions", "dance_3", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
     settings += ["--tuning.learning-rate", "1e-2", "--tuning.ema", "0.5"]  # so that 40 steps are seen
-    tune.main([str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings])
+    report = tmp_path / "packed" / "report.json"
+    report.write_text(json.dumps({"command": "train", "seed": 3, "hours": 2.0, "psi": {}}))
+    arguments = [str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings]
+    tune.main(arguments)
+    made = trained.made(tmp_path / "out")
+    assert made.pop("hours") > 2.0
+    assert made == {"command": f"train && python -m experiments.tune {' '.join(arguments)}", "seed": 3}
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))
     assert config.motions == ("dance_3",) and config.tuning.steps == 40 and before.tuning.steps == 20
     for (name, one), other in zip(checkpoint.named(phi).items(), checkpoint.named(phi_after).values(), strict=True):
