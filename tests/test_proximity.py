@@ -54,6 +54,16 @@ def test_winding_numbers_are_those_of_libigl(rounds, near):
     np.testing.assert_allclose(found, expected, atol=0.15)
 
 
+def test_what_fills_a_patch_up_does_not_wind():
+    """Twenty triangles in a patch of 32: far from a closed mesh its dipoles cancel."""
+    vertices, faces = icosphere(0)
+    away = np.random.default_rng(0).normal(size=(50, 3))
+    away *= 8.0 / np.linalg.norm(away, axis=1, keepdims=True)
+    groups = proximity.patches(vertices, faces).groups
+    found = proximity.winding_number(away.astype(np.float32), vertices.astype(np.float32)[faces], groups)
+    np.testing.assert_allclose(found, 0.0, atol=1e-3)
+
+
 def test_nearest_takes_the_first_of_equals():
     points = np.array([[1, 0, 0], [-1, 0, 0], [-1, 0, 0], [1, 0, 0]], np.float32)
     positions = np.array([[0, 0, 0], [-2, 0, 0], [2, 0, 0]], np.float32)
