@@ -19,23 +19,30 @@ WOUND = 0.25  # the least of it that does: it is 0 outside, 1 inside, and half o
 LEVEL = 1e-4  # m, planes that differ by less are one
 
 
-def find(positions: Array, body: Array, body_next: Array, patches: Patches) -> Contact:
+def find(
+    positions: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None = None
+) -> Contact:
     """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
 
     The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
     2005). Skinning turns skin inside out in bent hips and knees, and pushes it through to the other side: these then
     say of what is centimetres in front of a body that it is in it. So inside and deep, by the size of the triangle, is
     only what the body also winds around. Where the body ends, as where it was cut, the surface is taken to go on as far
-    as that. Plane and point go with their triangle to the next frame.
+    as that. Plane and point go with their triangle to the next frame. A foot that passes by takes its planes along,
+    through what it will not touch: one that is deep in where the body then does not wind around it, stays behind.
 
     Args:
         body, body_next: [B, 3] m at this frame and the next.
+        ahead: [V, 3] m, where the positions are expected at the next frame; None to leave out the last.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
-    return _planes(positions, nearest_face(positions, body[patches.faces], patches.groups), body, body_next, patches)
+    face = nearest_face(positions, body[patches.faces], patches.groups)
+    return _planes(positions, face, body, body_next, patches, ahead)
 
 
-def _planes(positions: Array, face: Array, body: Array, body_next: Array, patches: Patches) -> Contact:
+def _planes(
+    positions: Array, face: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None
+) -> Contact:
     """As `find`, with the nearest triangles [V] known."""
     faces, corners = patches.faces, body[patches.faces]
     here, there = corners[face], body_next[faces[face]]
@@ -47,7 +54,8 @@ def _planes(positions: Array, face: Array, body: Array, body_next: Array, patche
     pseudonormal, border = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
     inside = jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0
     deep = apart > DEEP**2 * jax.lax.stop_gradient(_areas(here))[:, None]
-    inside &= ~deep | (winding_number(positions, corners, patches.groups)[:, None] > WOUND)
+    doubtful = inside & deep
+    inside &= ~doubtful | (winding_number(positions, corners, patches.groups, doubtful[:, 0])[:, None] > WOUND)
     side = jnp.where(inside, -1.0, 1.0)
     on_surface = (apart < ON_SURFACE**2) | (border[:, None] & ~deep)
     normal = jnp.where(on_surface, pseudonormal, side * offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
@@ -55,11 +63,23 @@ def _planes(positions: Array, face: Array, body: Array, body_next: Array, patche
     turned = jnp.einsum("vca,va->vc", _axes(there), local, precision="highest")
     lost = jnp.sum(turned * turned, axis=-1, keepdims=True) < 0.99  # a triangle without area has no axes
     turned = jnp.where(lost, normal, turned)
+    if ahead is not None:
+        gap = jax.lax.stop_gradient(distance(ahead, point_next, turned))
+        deep = gap < -DEEP * jnp.sqrt(jax.lax.stop_gradient(_areas(there)))
+        passed = deep & (winding_number(ahead, body_next[faces], patches.groups, deep) <= WOUND)
+        back = gap - jnp.maximum(jax.lax.stop_gradient(distance(positions, point, normal)), 0.0)
+        point_next += jnp.where(passed, back, 0.0)[:, None] * turned
     return Contact(point, point_next, normal, turned, faces[face, jnp.argmax(weights, axis=1)])
 
 
 def find_at_edges(
-    positions: Array, planes: Contact, mesh: Mesh, body: Array, body_next: Array, patches: Patches
+    positions: Array,
+    planes: Contact,
+    mesh: Mesh,
+    body: Array,
+    body_next: Array,
+    patches: Patches,
+    ahead: Array | None = None,
 ) -> EdgeContact:
     """The contact of each edge where it comes nearest to the body between its ends, whose planes are `planes`.
 
@@ -78,9 +98,13 @@ def find_at_edges(
 
     before, after = beyond(start, a, b), beyond(end, b, a)
     place = jax.lax.stop_gradient(before / (before + after))
-    between = start + place[:, None] * (end - start)
-    face = nearest_face_around(between, body, patches, [planes.index[end] for end in (a, b)])
-    found = _planes(between, face, body, body_next, patches)
+
+    def between(x):
+        return x[a] + place[:, None] * (x[b] - x[a])
+
+    face = nearest_face_around(between(positions), body, patches, [planes.index[end] for end in (a, b)])
+    later = None if ahead is None else between(ahead)
+    found = _planes(between(positions), face, body, body_next, patches, later)
     return EdgeContact(place, found.point_next, found.normal_next)
 
 

@@ -64,7 +64,7 @@ def _around(faces: np.ndarray, count: int) -> np.ndarray:
     return (order[np.minimum(place, faces.size - 1)] // 3).astype(np.int32)
 
 
-def winding_number(positions: Array, corners: Array, groups: Array) -> Array:
+def winding_number(positions: Array, corners: Array, groups: Array, asked: Array) -> Array:
     """Winding number [V] of triangles [F, 3, 3] m about positions [V, 3] m: 1 inside a closed mesh, 0 outside.
 
     For each part of a patch stands a dipole, the first order of Barill et al. (2018), spread so that it has no pole:
@@ -73,6 +73,7 @@ def winding_number(positions: Array, corners: Array, groups: Array) -> Array:
 
     Args:
         groups: [G, PATCH] of `patches`.
+        asked: [V] bool, the positions to go through; those of the others are 0.
     """
     positions, corners, groups = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, corners, groups)))
     members = groups.reshape(-1)
@@ -83,11 +84,26 @@ def winding_number(positions: Array, corners: Array, groups: Array) -> Array:
     moment = jnp.sum(size * jnp.mean(corners, axis=1)[members].reshape(-1, PART, 3), axis=1)
     size, dipole = jnp.sum(size, axis=1), jnp.sum(area, axis=1)
     centre = moment / jnp.maximum(size, 1e-30)
-    # one coordinate after the other, so that it fuses
-    offset = [centre[None, :, i] - positions[:, None, i] for i in range(3)]
-    along = sum(offset[i] * dipole[None, :, i] for i in range(3))
-    squared = jnp.maximum(sum(x * x for x in offset) + SPREAD * size[None, :, 0], 1e-30)
-    return jnp.sum(along / (squared * jnp.sqrt(squared)), axis=1) / (4.0 * jnp.pi)
+    rows, chunks = _chunks(asked)
+
+    def chunk(index, found):
+        row = jax.lax.dynamic_slice(rows, (index * CHUNK,), (CHUNK,))
+        position = positions[jnp.minimum(row, len(positions) - 1)]
+        # one coordinate after the other, so that it fuses
+        offset = [centre[None, :, i] - position[:, None, i] for i in range(3)]
+        along = sum(offset[i] * dipole[None, :, i] for i in range(3))
+        squared = jnp.maximum(sum(x * x for x in offset) + SPREAD * size[None, :, 0], 1e-30)
+        total = jnp.sum(along / (squared * jnp.sqrt(squared)), axis=1) / (4.0 * jnp.pi)
+        return found.at[row].set(total, mode="drop")
+
+    return jax.lax.fori_loop(0, chunks, chunk, jnp.zeros(len(positions), positions.dtype))
+
+
+def _chunks(chosen: Array) -> tuple[Array, Array]:
+    """The places of what is true of [V], in an array of whole chunks filled up with V, and how many of these it takes."""
+    count = chosen.shape[0]
+    (rows,) = jnp.nonzero(chosen, size=-(-count // CHUNK) * CHUNK, fill_value=count)
+    return rows, -(-jnp.sum(chosen) // CHUNK)
 
 
 def nearest_point(positions: Array, points: Array) -> Array:
@@ -255,7 +271,7 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
     for _ in range(min(PASSES, last_group + 1)):
         best, face, last = visit(number, positions, keys, best, face, last)
     left = may_improve(following(keys, last), best)
-    (rows,) = jnp.nonzero(left, size=-(-count // CHUNK) * CHUNK, fill_value=count)
+    rows, chunks = _chunks(left)
 
     def chunk(index, state):
         best, face = state
@@ -273,5 +289,4 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
         found, found_face, _, _ = jax.lax.while_loop(lambda state: jnp.any(state[3]), more, state)
         return best.at[row].set(found, mode="drop"), face.at[row].set(found_face, mode="drop")
 
-    chunks = -(-jnp.sum(left) // CHUNK)
     return jax.lax.fori_loop(0, chunks, chunk, (best, face))[1]

@@ -63,15 +63,16 @@ def time_step(
     """The incremental potential's constants for the step from `window.current` to `window.following`."""
     physics = config.physics
     body, body_next = window.current.body, window.following.body
+    ahead = state.position + state.velocity
     planes = near = at_edges = on_self = None
     if scene.touchable and physics.contact_surface == "triangles":
-        planes = contact.find(state.position, body, body_next, scene.patches)
+        planes = contact.find(state.position, body, body_next, scene.patches, ahead)
     elif scene.touchable:
         planes = contact.find_at_centroids(state.position, body, body_next, scene.body.faces)
     if planes is not None and "friction" not in physics.without:
         near = losses.touching(state.position, planes, physics.friction_radius)
     if planes is not None and physics.edge_contact:
-        at_edges = contact.find_at_edges(state.position, planes, scene.mesh, body, body_next, scene.patches)
+        at_edges = contact.find_at_edges(state.position, planes, scene.mesh, body, body_next, scene.patches, ahead)
     if physics.self_contact:
         on_self = contact.find_on_self(state.position, scene.garment_patches)
     return TimeStep(

@@ -223,7 +223,7 @@ def test_nothing_is_inside_in_front_of_skin_that_is_folded_inside_out(turns, bet
         np.asarray(positions, np.float64), np.asarray(body, np.float64), np.asarray(scene.body.faces, np.int64),
         sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
     )[0]  # fmt: skip
-    state = rollout.start(character, window, 0)._replace(position=positions)
+    state = rollout.start(character, window, 0)._replace(position=positions, velocity=jnp.zeros_like(positions))
     found = rollout.time_step(scene, character, state, window, jnp.float32(1 / 30), config).contact
     wrong, right = energies(pseudonormals)
     still_wrong, still_right = energies(contact.distance(positions, found.point, found.normal))
@@ -247,6 +247,32 @@ def test_nothing_is_inside_in_front_of_skin_that_was_pushed_through():
     positions = np.stack([x / 2 + 0.18, 2 * y, np.zeros(50)], axis=1).astype(np.float32)  # where it still is a slab
     found = contact.find(positions, vertices, vertices, patches)
     assert (contact.distance(positions, found.point, found.normal) < 0).all()
+
+
+@pytest.mark.parametrize("height, speed", [(0.058, 0.0), (0.058, 0.05), (0.04, 0.0), (0.056, 0.12)])
+def test_a_foot_that_passes_by_does_not_take_cloth_along(height, speed):
+    """A foot 0.1 m high moves by 0.12 m along x, past cloth at a height over its middle and a little before it."""
+    foot = trimesh.creation.box((0.25, 0.1, 0.1)).subdivide_to_size(0.025)
+    vertices = np.asarray(foot.vertices, np.float32)
+    patches, mesh = proximity.patches(vertices, foot.faces), topology.mesh(np.array([[0, 1, 2]]))
+    step = np.float32([0.12, 0.0, 0.0])
+    positions = np.float32([[0.13, height, -0.02], [0.13, height, 0.02], [0.13, height, 0.03]])
+    ahead = positions + np.float32([speed, 0.0, 0.0])
+    moved = vertices + step
+    planes = contact.find(positions, vertices, moved, patches)
+    kept = contact.find(positions, vertices, moved, patches, ahead)
+    late, gap = (np.asarray(contact.distance(ahead, x.point_next, x.normal_next)) for x in (planes, kept))
+    edges = contact.find_at_edges(positions, kept, mesh, vertices, moved, patches, ahead)
+    at_edges = np.sum((ahead[:1] - edges.point_next) * edges.normal_next, axis=1)
+    hit, along = height < 0.05, speed == 0.12
+    if hit or along:  # it is in the way, or goes with the foot
+        np.testing.assert_array_equal(gap, late)
+        assert (gap < -0.05).all() if hit else (gap > 0).all()
+    else:
+        assert (late < -0.02).all()
+        np.testing.assert_allclose(gap, contact.distance(positions, kept.point, kept.normal), atol=1e-6)
+        assert (gap > 0).all() and (at_edges > 0).all()
+    np.testing.assert_array_equal(kept.normal_next, planes.normal_next)
 
 
 def limb(half_width=0.01):

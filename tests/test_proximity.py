@@ -36,9 +36,13 @@ def test_winding_numbers_are_those_of_libigl(rounds, near):
     positions = positions[apart > near]
     patches = proximity.patches(vertices, faces)
     shift = np.float32([3.0, -2.0, 1.0])
-    found = jax.jit(proximity.winding_number)(
-        (positions + shift).astype(np.float32), (vertices + shift).astype(np.float32)[faces], patches.groups
-    )
+    moved = (positions + shift).astype(np.float32), (vertices + shift).astype(np.float32)[faces]
+    everywhere = np.ones(len(positions), bool)
+    found = jax.jit(proximity.winding_number)(*moved, patches.groups, everywhere)
+    some = random.uniform(size=len(positions)) < 0.1
+    np.testing.assert_array_equal(proximity.winding_number(*moved, patches.groups, some)[~some], 0.0)
+    np.testing.assert_allclose(proximity.winding_number(*moved, patches.groups, some)[some], found[some], atol=1e-5)
+    np.testing.assert_array_equal(proximity.winding_number(*moved, patches.groups, ~everywhere), 0.0)
     expected = igl.fast_winding_number(vertices, faces.astype(np.int64), positions)
     np.testing.assert_allclose(found, expected, atol=0.15)
     inside = expected > 0.5
@@ -49,6 +53,7 @@ def test_winding_numbers_are_those_of_libigl(rounds, near):
         positions.astype(np.float32),
         vertices.astype(np.float32)[open_ball],
         proximity.patches(vertices, open_ball).groups,
+        everywhere,
     )
     expected = igl.fast_winding_number(vertices, open_ball.astype(np.int64), positions)
     np.testing.assert_allclose(found, expected, atol=0.15)
@@ -60,7 +65,8 @@ def test_what_fills_a_patch_up_does_not_wind():
     away = np.random.default_rng(0).normal(size=(50, 3))
     away *= 8.0 / np.linalg.norm(away, axis=1, keepdims=True)
     groups = proximity.patches(vertices, faces).groups
-    found = proximity.winding_number(away.astype(np.float32), vertices.astype(np.float32)[faces], groups)
+    corners = vertices.astype(np.float32)[faces]
+    found = proximity.winding_number(away.astype(np.float32), corners, groups, np.ones(50, bool))
     np.testing.assert_allclose(found, 0.0, atol=1e-3)
 
 
