@@ -62,3 +62,19 @@ def test_cloth_is_pushed_out_of_a_body_that_moves_into_it():
     left, _ = metrics.penetration(new, bodies[1], faces)
     free = ~engine.pinned
     assert deep[free].max() > 5e-3 and left[free].max() < 1e-3
+
+
+def test_friction_takes_cloth_along_with_a_body_that_slides_past():
+    """A body that grows wider as it goes forwards, against the sides of a skirt."""
+    whole, engine, now, body = wears("skirt_1000")
+    wider = body * [1.2, 1.0, 1.0]
+    faces = np.asarray(whole.scene.body.faces)
+    deep, _ = metrics.penetration(now, wider, faces)
+    aside = ~engine.pinned & (deep > 3e-3) & (np.abs(now[:, 2] - now[:, 2].mean()) < 0.05)
+    still, along = (
+        engine.step(now, np.zeros_like(now), now, np.stack([wider, wider + [0.0, 0.0, forwards]]))
+        for forwards in (0.0, 0.02)
+    )
+    taken = (along - still)[aside, 2]
+    assert aside.sum() > 5
+    assert np.median(taken) > 0.002 and taken.max() < 0.03

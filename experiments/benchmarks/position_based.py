@@ -70,6 +70,8 @@ class Xpbd:
             bodies: [2, B, 3] m, at this frame and the next.
         """
         position = now
+        # friction is with a body that moves
+        self.body.mesh.velocities.assign(((bodies[1] - bodies[0]) / (self.substeps * self.timestep)).astype(np.float32))
         for substep in range(self.substeps):
             share = (substep + 1) / self.substeps
             pinned = (1.0 - share) * now + share * held
@@ -81,7 +83,7 @@ class Xpbd:
             self.collide.collide(self.now, self.contacts)
             self.solver.step(self.now, self.next, self.control, self.contacts, self.timestep)
             position, velocity = self.next.particle_q.numpy(), self.next.particle_qd.numpy()
-        return position
+        return position.copy()  # not the engine's own memory
 
 
 def springs(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray, mu: float, lam: float) -> np.ndarray:
