@@ -100,7 +100,7 @@ def winding_number(positions: Array, corners: Array, groups: Array, asked: Array
 
 
 def _chunks(chosen: Array) -> tuple[Array, Array]:
-    """The places of what is true of [V], in an array of whole chunks filled up with V, and how many of these it takes."""
+    """The places of what is true of [V], in whole chunks filled up with V, and how many chunks have any."""
     count = chosen.shape[0]
     (rows,) = jnp.nonzero(chosen, size=-(-count // CHUNK) * CHUNK, fill_value=count)
     return rows, -(-jnp.sum(chosen) // CHUNK)
