@@ -19,9 +19,7 @@ WOUND = 0.25  # the least of it that does: it is 0 outside, 1 inside, and half o
 LEVEL = 1e-4  # m, planes that differ by less are one
 
 
-def find(
-    positions: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None = None
-) -> Contact:
+def find(positions: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None = None) -> Contact:
     """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
 
     The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
