@@ -63,8 +63,8 @@ def _planes(
     turned = jnp.where(lost, normal, turned)
     if ahead is not None:
         gap = jax.lax.stop_gradient(distance(ahead, point_next, turned))
-        deep = gap < -DEEP * jnp.sqrt(jax.lax.stop_gradient(_areas(there)))
-        passed = deep & (winding_number(ahead, body_next[faces], patches.groups, deep) <= WOUND)
+        doubtful = gap < -DEEP * jnp.sqrt(jax.lax.stop_gradient(_areas(there)))
+        passed = doubtful & (winding_number(ahead, body_next[faces], patches.groups, doubtful) <= WOUND)
         back = gap - jnp.maximum(jax.lax.stop_gradient(distance(positions, point, normal)), 0.0)
         point_next += jnp.where(passed, back, 0.0)[:, None] * turned
     return Contact(point, point_next, normal, turned, faces[face, jnp.argmax(weights, axis=1)])
@@ -83,7 +83,7 @@ def find_at_edges(
 
     That place is where the planes of both ends are equally far: over a body's edge, which has one of the ends on
     either side, the point of the garment's edge above it; over a flat part the middle. What is nearest to it is sought
-    near what is nearest to the ends.
+    near what is nearest to the ends. Planes of passing parts stay behind as in `find`, with `ahead` as there.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
     a, b = mesh.edges[:, 0], mesh.edges[:, 1]

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from clothjax import character as characters
-from clothjax import clips, contact, experiment, proximity, rollout, skinning, topology
+from clothjax import clips, contact, experiment, losses, proximity, rollout, skinning, topology
 from clothjax.config import Config
 from clothjax.types import Pose
 
@@ -273,6 +273,52 @@ def test_a_foot_that_passes_by_does_not_take_cloth_along(height, speed):
         np.testing.assert_allclose(gap, contact.distance(positions, kept.point, kept.normal), atol=1e-6)
         assert (gap > 0).all() and (at_edges > 0).all()
     np.testing.assert_array_equal(kept.normal_next, planes.normal_next)
+
+
+def test_a_plane_that_stays_behind_lets_go_of_what_was_inside():
+    """0.5 mm behind the front of a foot that then passes under it."""
+    foot = trimesh.creation.box((0.25, 0.1, 0.1)).subdivide_to_size(0.025)
+    vertices = np.asarray(foot.vertices, np.float32)
+    positions = np.float32([[0.1245, 0.0485, 0.0]])
+    ahead = positions + np.float32([0.0, 0.025, 0.0])
+    moved = vertices + np.float32([0.12, 0.0, 0.0])
+    found = contact.find(positions, vertices, moved, proximity.patches(vertices, foot.faces), ahead)
+    np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), -5e-4, atol=1e-6)
+    np.testing.assert_allclose(contact.distance(ahead, found.point_next, found.normal_next), 0.0, atol=1e-6)
+
+
+def test_a_time_step_leaves_planes_behind():
+    """A t-shirt that rests while its wearer leaps forwards by 12 cm: what the body is then not around is let go."""
+    config = Config(garment="tshirt_1000")
+    whole = experiment.assemble(config)
+    scene, mesh = whole.scene, whole.scene.mesh
+    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
+    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "walk_0")))
+    poses = clips.poses(reel, jnp.int32(40))
+    leap = poses._replace(translation=jnp.zeros((3, 3)).at[2, 2].set(0.12))
+    window = characters.window(scene, character, leap)
+    state = rollout.start(character, window, 0)
+    state = state._replace(velocity=jnp.zeros_like(state.velocity))
+    step = rollout.time_step(scene, character, state, window, jnp.float32(1 / 30), config)
+    body, body_next, x = window.current.body, window.following.body, state.position
+    planes = contact.find(x, body, body_next, scene.patches)
+    at_edges = contact.find_at_edges(x, planes, mesh, body, body_next, scene.patches)
+    vertices = skinning.pose_body(
+        whole.body, whole.body.vertices, whole.body.joints, Pose(leap.rotations[2], leap.translation[2])
+    )
+    ends = np.asarray(x)[np.asarray(mesh.edges)]
+    places = ends[:, 0] + np.asarray(at_edges.place)[:, None] * (ends[:, 1] - ends[:, 0])
+    for name, where in (("collision", x), ("edge_collision", places)):
+        outside = winding(whole, np.asarray(vertices, np.float64), where) < 0.5
+        energies = [
+            np.asarray(losses.elements(x, some, mesh, config.physics)[name])
+            for some in (step._replace(contact=planes, edge_contact=at_edges), step)
+        ]
+        wrong, still_wrong = (e[outside].sum() for e in energies)
+        right, still_right = (e[~outside].sum() for e in energies)
+        assert wrong > 1.0 and right > 1.0  # J
+        assert still_wrong <= 0.5 * wrong  # what is shallow goes along
+        assert still_right >= 0.95 * right
 
 
 def limb(half_width=0.01):
