@@ -19,6 +19,7 @@ def diffuse(
     samples: int = 0,
     spread: float = 0.05,
     hidden: np.ndarray | None = None,
+    pinned: np.ndarray | None = None,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Skinning weights [V, J] and shape directions [V, 3, S] for a garment around a body (HOOD's way).
@@ -33,6 +34,8 @@ def diffuse(
         spread: m, deviation of a blur over a tight garment, which would tear where the nearest jumps from
             arm to trunk or leg to leg.
         hidden: [B] bool, body vertices that give no data, such as hands beside the hips.
+        pinned: [V] bool, those that skinning alone moves: they get the data of the nearest point on the body
+            as it is, for with any other they would not stay outside of the body.
         seed: of the samples.
 
     Raises:
@@ -44,11 +47,13 @@ def diffuse(
     points, vertices = np.asarray(points, np.float64), np.asarray(body.vertices, np.float64)
     shapedirs = np.reshape(body.shapedirs, (len(vertices), -1))
     data = np.concatenate([body.weights, shapedirs], axis=1).astype(np.float64)
+    fixed = np.zeros(len(points), bool) if pinned is None else np.asarray(pinned, bool)
+    nearest = _nearest(points, vertices, np.asarray(body.faces, np.int64), usable, data)
     if samples:
         mixed = _sampled(points, vertices[usable], data[usable], samples, seed)
+        mixed[fixed] = nearest[fixed]
     else:
-        mixed = _nearest(points, vertices, np.asarray(body.faces, np.int64), usable, data)
-        mixed = _blur(mixed, points, np.asarray(faces), spread)
+        mixed = _blur(nearest, points, np.asarray(faces), spread, fixed)
     joints = body.weights.shape[1]
     weights = np.clip(mixed[:, :joints], 0, None)
     least_kept = np.sort(weights, axis=1)[:, -min(INFLUENCES, joints)][:, None]
@@ -74,13 +79,14 @@ def _nearest(points, vertices, faces, usable, data) -> np.ndarray:
     return np.einsum("vk,vkd->vd", share, data[corners])
 
 
-def _blur(data: np.ndarray, points: np.ndarray, faces: np.ndarray, deviation: float) -> np.ndarray:
-    """Half steps towards the mean of the neighbours; each adds a quarter of an edge squared per axis."""
+def _blur(data: np.ndarray, points: np.ndarray, faces: np.ndarray, deviation: float, fixed: np.ndarray) -> np.ndarray:
+    """Half steps towards the mean of the neighbours, but where it is fixed; each adds a quarter of an edge squared
+    per axis."""
     edges = edge_table(faces)[0]
     square = np.mean(np.sum((points[edges[:, 0]] - points[edges[:, 1]]) ** 2, axis=1))
     start, end = np.concatenate([edges, edges[:, ::-1]]).T
     mean = coo_matrix((np.ones(len(start)), (start, end)), (len(points), len(points))).tocsr()
     count = np.maximum(np.asarray(mean.sum(axis=1)), 1)
     for _ in range(round(4 * deviation**2 / square)):
-        data = (data + (mean @ data) / count) / 2
+        data = np.where(fixed[:, None], data, (data + (mean @ data) / count) / 2)
     return data

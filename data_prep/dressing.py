@@ -81,5 +81,5 @@ def dress(
         pinned: [V].
         samples: of the diffusion, for loose garments; 0 for tight ones.
     """
-    weights, shapedirs = diffuse(vertices, faces, body, samples=samples, hidden=hidden, seed=seed)
+    weights, shapedirs = diffuse(vertices, faces, body, samples=samples, hidden=hidden, pinned=pinned, seed=seed)
     return Garment(vertices.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned)

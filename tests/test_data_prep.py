@@ -11,10 +11,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from clothjax import plausibility, storage
+from clothjax import plausibility, skinning, storage
 from clothjax.types import Body
 from data_prep import anny, asf_amc, bvh, garment, mesh, procedural, retarget
 from data_prep.diffusion import diffuse
+from data_prep.dressing import WINDING
 from data_prep.remesh import remesh
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
@@ -455,6 +456,38 @@ def test_hidden_body_gives_no_data():
         assert weights[:, 0].max() < 0.5 + 0.02
     with pytest.raises(ValueError, match="hidden"):
         diffuse(points, np.array([[0, 1, 2]]), body, hidden=np.ones(len(hidden), bool))
+
+
+@pytest.mark.parametrize("samples", [0, 20])
+def test_pinned_vertices_have_the_data_of_the_surface(samples):
+    body = _sphere_body()
+    vertices, faces = mesh.clip(1.02 * np.asarray(body.vertices), body.faces, body.vertices[:, 1] - 0.3)
+    pinned = mesh.boundary_mask(faces, len(vertices))
+    weights, shapedirs = diffuse(vertices, faces, body, samples=samples, pinned=pinned)
+    np.testing.assert_allclose(weights[pinned, 0], (1 + vertices[pinned, 0] / 1.02) / 2, atol=2e-3)
+    np.testing.assert_allclose(shapedirs[pinned, :, 1], 2 * vertices[pinned] / 1.02, atol=5e-3)
+    blurred, _ = diffuse(vertices, faces, body, samples=samples)
+    away = vertices[:, 1] < vertices[pinned, 1].min() - 0.5
+    assert away.any()
+    np.testing.assert_allclose(weights[away], blurred[away], atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["pants_1000", "pants_4000", "skirt_1000", "skirt_4000", "built"])
+def test_pinned_waists_stay_outside_of_who_bends(name, body, names):
+    """A slim and a middling wearer who sit and lean forwards; a heavy one's belly would be within the thighs."""
+    worn = garment.build("skirt", 300, body, names) if name == "built" else storage.load_garment(name, body)
+    rotations = np.tile(np.eye(3, dtype=np.float32), (len(names), 1, 1))
+    for joint, degrees in {"LowerBack": 30, "LeftUpLeg": -60, "RightUpLeg": -60}.items():
+        rotations[names.index(joint)] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    for betas in (np.zeros(10, np.float32), np.float32([-3, 2] + 8 * [0])):
+        joints = skinning.shaped_joints(body, betas)
+        transforms = skinning.joint_transforms(rotations, joints, body.parents)
+        posed, waist = (
+            np.float64(skinning.apply(skinning.blend(it.weights, transforms), skinning.shaped_vertices(it, betas)))
+            for it in (body, worn)
+        )
+        distance = igl.signed_distance(waist[worn.pinned], posed, body.faces.astype(np.int64), sign_type=WINDING)[0]
+        assert distance.min() > 0
 
 
 def test_skirt_template(tmp_path, body, names):
