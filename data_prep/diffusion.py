@@ -35,20 +35,21 @@ def diffuse(
             arm to trunk or leg to leg.
         hidden: [B] bool, body vertices that give no data, such as hands beside the hips.
         pinned: [V] bool, those that skinning alone moves: they get the data of the nearest point on the body
-            as it is, for with any other they would not stay outside of the body.
+            as it is, and so keep their distance to it when it bends, unless it folds there.
         seed: of the samples.
 
     Raises:
-        ValueError: if every body vertex is hidden.
+        ValueError: if no face of the body is left that has no hidden vertex.
     """
     usable = np.ones(len(body.vertices), bool) if hidden is None else ~hidden
-    if not usable.any():
-        raise ValueError("every vertex of the body is hidden: nothing to take the skinning from")
+    surface = np.asarray(body.faces, np.int64)[usable[body.faces].all(axis=1)]
+    if not len(surface):
+        raise ValueError("every face of the body has a hidden vertex: nothing to take the skinning from")
     points, vertices = np.asarray(points, np.float64), np.asarray(body.vertices, np.float64)
     shapedirs = np.reshape(body.shapedirs, (len(vertices), -1))
     data = np.concatenate([body.weights, shapedirs], axis=1).astype(np.float64)
     fixed = np.zeros(len(points), bool) if pinned is None else np.asarray(pinned, bool)
-    nearest = _nearest(points, vertices, np.asarray(body.faces, np.int64), usable, data)
+    nearest = _nearest(points, vertices, surface, data)
     if samples:
         mixed = _sampled(points, vertices[usable], data[usable], samples, seed)
         mixed[fixed] = nearest[fixed]
@@ -71,8 +72,7 @@ def _sampled(points, vertices, data, samples: int, seed: int) -> np.ndarray:
     return mixed / samples
 
 
-def _nearest(points, vertices, faces, usable, data) -> np.ndarray:
-    faces = faces[usable[faces].all(axis=1)]
+def _nearest(points, vertices, faces, data) -> np.ndarray:
     _, face, foot = igl.point_mesh_squared_distance(points, vertices, faces)[:3]
     corners = faces[face]
     share = igl.barycentric_coordinates(foot, *(np.ascontiguousarray(vertices[c]) for c in corners.T))
@@ -80,8 +80,7 @@ def _nearest(points, vertices, faces, usable, data) -> np.ndarray:
 
 
 def _blur(data: np.ndarray, points: np.ndarray, faces: np.ndarray, deviation: float, fixed: np.ndarray) -> np.ndarray:
-    """Half steps towards the mean of the neighbours, but where it is fixed; each adds a quarter of an edge squared
-    per axis."""
+    """Half steps to the neighbours' mean, except where fixed; each adds to the variance a quarter edge squared."""
     edges = edge_table(faces)[0]
     square = np.mean(np.sum((points[edges[:, 0]] - points[edges[:, 1]]) ** 2, axis=1))
     start, end = np.concatenate([edges, edges[:, ::-1]]).T

@@ -454,8 +454,10 @@ def test_hidden_body_gives_no_data():
     for samples in (0, 20):
         weights, _ = diffuse(points, np.array([[0, 1, 2]]), body, samples=samples, hidden=hidden)
         assert weights[:, 0].max() < 0.5 + 0.02
-    with pytest.raises(ValueError, match="hidden"):
-        diffuse(points, np.array([[0, 1, 2]]), body, hidden=np.ones(len(hidden), bool))
+    hidden = np.arange(len(hidden)) > 0  # of a lone vertex there is no surface
+    for samples in (0, 20):
+        with pytest.raises(ValueError, match="hidden"):
+            diffuse(points, np.array([[0, 1, 2]]), body, samples=samples, hidden=hidden)
 
 
 @pytest.mark.parametrize("samples", [0, 20])
@@ -466,10 +468,22 @@ def test_pinned_vertices_have_the_data_of_the_surface(samples):
     weights, shapedirs = diffuse(vertices, faces, body, samples=samples, pinned=pinned)
     np.testing.assert_allclose(weights[pinned, 0], (1 + vertices[pinned, 0] / 1.02) / 2, atol=2e-3)
     np.testing.assert_allclose(shapedirs[pinned, :, 1], 2 * vertices[pinned] / 1.02, atol=5e-3)
+
+
+@pytest.mark.parametrize("samples", [0, 20])
+def test_what_is_not_pinned_is_blurred_as_ever(samples):
+    body = _sphere_body()
+    right = (np.asarray(body.vertices)[:, :1] > 0).astype(float)
+    body = body._replace(weights=np.concatenate([right, 1 - right], axis=1))
+    vertices, faces = mesh.clip(1.02 * np.asarray(body.vertices), body.faces, body.vertices[:, 1] - 0.3)
+    pinned = mesh.boundary_mask(faces, len(vertices))
+    weights, _ = diffuse(vertices, faces, body, samples=samples, pinned=pinned)
     blurred, _ = diffuse(vertices, faces, body, samples=samples)
     away = vertices[:, 1] < vertices[pinned, 1].min() - 0.5
-    assert away.any()
     np.testing.assert_allclose(weights[away], blurred[away], atol=1e-3)
+    between = np.minimum(weights[:, 0], weights[:, 1]) > 0.1  # where the body's own jump from 0 to 1
+    assert between[away].mean() > 0.03
+    assert between[pinned].mean() < between[away].mean()
 
 
 @pytest.mark.parametrize("name", ["pants_1000", "pants_4000", "built"])
