@@ -83,7 +83,11 @@ def find_at_edges(
 
     That place is where the planes of both ends are equally far: over a body's edge, which has one of the ends on
     either side, the point of the garment's edge above it; over a flat part the middle. What is nearest to it is sought
-    near what is nearest to the ends. Planes of passing parts stay behind as in `find`, with `ahead` as there.
+    near what is nearest to the ends.
+
+    Args:
+        positions, ahead: [V, 3] m, as of `find`, whose `planes` [V, ...] are those of the vertices.
+        body, body_next: [B, 3] m at this frame and the next.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
     a, b = mesh.edges[:, 0], mesh.edges[:, 1]
