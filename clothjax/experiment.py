@@ -116,16 +116,18 @@ def material(config: Config) -> Material:
 def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
     """Betas [S] and material of a thin, the mean and a heavy body in soft, middling and stiff cloth.
 
-    Thin and heavy are `evaluation.betas` standard deviations along the direction in which the body's volume grows most.
+    Thin and heavy are `evaluation.betas` standard deviations along the direction in which the body's volume grows most
+    of those in which its height stays.
     """
     body, cloth = experiment.body, experiment.config.material
     count = body.shapedirs.shape[-1]
 
-    def volume(betas):
-        corners = np.asarray(skinning.shaped_vertices(body, jnp.asarray(betas, jnp.float32)), np.float64)[body.faces]
-        return np.linalg.det(corners).sum() / 6
+    def volume_and_height(betas):
+        vertices = np.asarray(skinning.shaped_vertices(body, jnp.asarray(betas, jnp.float32)), np.float64)
+        return np.array([np.linalg.det(vertices[body.faces]).sum() / 6, np.ptp(vertices[:, 1])])
 
-    growth = np.array([volume(unit) - volume(-unit) for unit in np.eye(count)])
+    growth, rise = np.transpose([volume_and_height(unit) - volume_and_height(-unit) for unit in np.eye(count)])
+    growth -= growth @ rise / max(rise @ rise, 1e-12) * rise
     heavy = experiment.config.evaluation.betas * growth / max(np.linalg.norm(growth), 1e-12)
     bodies = {"thin": -heavy, "mean": 0 * heavy, "heavy": heavy}
     ranges = (cloth.mu_range, cloth.lam_range, cloth.bending_range)

@@ -182,12 +182,13 @@ def test_wearers_are_thin_and_heavy_soft_and_stiff():
     wearers = experiment.wearers(whole)
     assert len(wearers) == 9
 
-    def waist(betas):
-        vertices = np.asarray(whole.body.vertices + np.asarray(whole.body.shapedirs) @ betas)
-        return np.ptp(vertices, axis=0)[2]
+    def size(betas):
+        return np.ptp(np.asarray(whole.body.vertices + np.asarray(whole.body.shapedirs) @ betas), axis=0)
 
-    thin, mean, heavy = (waist(wearers[f"{shape}, soft"][0]) for shape in ("thin", "mean", "heavy"))
+    sizes = [size(wearers[f"{shape}, soft"][0]) for shape in ("thin", "mean", "heavy")]
+    _, (low, middle, high), (thin, mean, heavy) = np.transpose(sizes)
     assert thin < mean < heavy
+    np.testing.assert_allclose([low, high], middle, rtol=0.01)
     soft, middling, stiff = (wearers[f"mean, {cloth}"][1] for cloth in ("soft", "middling", "stiff"))
     assert soft.mu < middling.mu < stiff.mu and soft.bending < middling.bending < stiff.bending
 
