@@ -181,7 +181,7 @@ def _of(whole, garment):
 
 
 def _takes_a_step(whole):
-    state, metrics = program(*scenes.update(whole)).run()
+    state, metrics = program(*scenes.update(whole))()
     assert np.isfinite(metrics["loss"]).all() and not metrics["nonfinite"].any()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.pool.cloth)))
 
