@@ -114,7 +114,7 @@ def start(config, directory, *arguments, count=1):
     )
 
 
-def finish(*processes, seconds=400):
+def finish(*processes, seconds=1200):
     outputs = [process.communicate(timeout=seconds)[0] for process in processes]
     for process, output in zip(processes, outputs):
         assert process.returncode == 0, output
