@@ -48,6 +48,6 @@ $(INSTALLED): pyproject.toml uv.lock
 	        echo "no Python 3.11 or newer with its venv module (tried: $(CANDIDATES))" >&2
 	        exit 1
 	    fi
-	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[dev,demo,docs,export,render,sweep]'
+	    $(PYTHON) -m pip install --disable-pip-version-check --editable '.[data,dev,demo,docs,export,render,sweep]'
 	fi
 	touch $@

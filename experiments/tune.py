@@ -4,7 +4,8 @@
 
 Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
 garment, for `clothjax.load` and all programs that take a run, with how it was made in report.json, and `tuning/`. Run
-again, it goes on where it stopped.
+again, it goes on where it stopped. A garment of the library is configured to be measured on motion capture too, which
+does not come with it: evaluate with `--motion walk_3`.
 """
 
 import argparse
