@@ -8,7 +8,7 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 API := runs/api
-MODULES := $(patsubst clothjax/%.py,clothjax.%,$(filter-out clothjax/__%,$(wildcard clothjax/*.py)))
+MODULES := $(subst /,.,$(patsubst %.py,%,$(filter-out %__init__.py %__main__.py,$(wildcard clothjax/*.py clothjax/*/*.py))))
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 .PHONY: quickstart demo docs test test-slow lint
@@ -20,7 +20,7 @@ demo: $(INSTALLED)  ## a character that you steer, live in the browser
 	@$(PYTHON) -m experiments.demo
 
 docs: $(INSTALLED)  ## the reference of the library, made from its docstrings: runs/api/index.html
-	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax clothjax.export $(MODULES)
+	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax $(MODULES)
 
 test: $(INSTALLED)  ## the tests of every day
 	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile

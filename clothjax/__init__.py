@@ -3,18 +3,18 @@
 import importlib
 
 _HOMES = {
-    "animate": "inference",
-    "crowd": "inference",
-    "initial_state": "inference",
-    "load": "inference",
+    "animate": "runtime.inference",
+    "crowd": "runtime.inference",
+    "initial_state": "runtime.inference",
+    "load": "runtime.inference",
     "Material": "types",
-    "Model": "inference",
+    "Model": "runtime.inference",
     "Motion": "types",
     "Pose": "types",
-    "specialise": "folding",
-    "State": "inference",
-    "step": "inference",
-    "step_crowd": "inference",
+    "specialise": "runtime.specialise",
+    "State": "runtime.inference",
+    "step": "runtime.inference",
+    "step_crowd": "runtime.inference",
 }
 __all__ = list(_HOMES)
 

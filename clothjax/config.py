@@ -278,7 +278,7 @@ class TuningConfig(Stage1Config):
 
 @dataclass(frozen=True)
 class PeerConfig:
-    """A network of a peer in the place of Phi and Psi (`clothjax/peers.py`), trained with the settings of stage 1.
+    """A baseline in the place of Phi and Psi (`clothjax/networks/baselines.py`), trained with the settings of stage 1.
     Gradients pass through its memory over a whole rollout."""
 
     network: Literal["", "ncs", "snug", "direct"] = ""

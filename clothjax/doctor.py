@@ -94,7 +94,7 @@ def _devices() -> tuple[str, bool]:
 
 def _garments() -> tuple[list[str], bool]:
     """Whether the garments that come with the library can be read."""
-    from clothjax import trained
+    from clothjax.runtime import trained
 
     lines, sound = [], True
     for name in trained.shipped():

@@ -14,12 +14,12 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import UNREADABLE, canonical_rotation, joint_names, load_body, save_motion
+from clothjax.cli import fail_clearly
+from clothjax.files.storage import UNREADABLE, canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
 from data_prep.repair import Bad, mend
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
 from data_prep.smpl import BODY
-from experiments.session import fail_clearly
 
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 

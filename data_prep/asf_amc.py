@@ -14,10 +14,10 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import joint_names, load_body, save_motion
+from clothjax.cli import fail_clearly
+from clothjax.files.storage import joint_names, load_body, save_motion
 from data_prep.repair import Bad, mend
 from data_prep.retarget import Capture, numbers, read_lines, retarget
-from experiments.session import fail_clearly
 
 CMU_NAMES = {
     "root": "Hips",

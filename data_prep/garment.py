@@ -20,24 +20,15 @@ import tyro
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import ConvexHull
 
+from clothjax.cli import fail_clearly
 from clothjax.config import HANDS
-from clothjax.storage import joint_names, load_body, save_garment
+from clothjax.files.storage import joint_names, load_body, save_garment
 from clothjax.types import Body, Garment
-from data_prep.dressing import (
-    ARM,
-    FOREARM,
-    WINDING,
-    clear_vertices,
-    dress,
-    highest_opening,
-    limbs,
-    push_out,
-)
+from data_prep.dressing import ARM, FOREARM, WINDING, clear_vertices, dress, highest_opening, limbs, push_out
 from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
 from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
 from data_prep.user_mesh import FEWEST, MOST, Answers, Unit, Up, bring, draw
-from experiments.session import fail_clearly
 
 OFFSET = 0.012  # m, of the solid from the body
 CELL = 0.008  # m, of the distance field's grid

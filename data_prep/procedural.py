@@ -16,10 +16,10 @@ import tyro
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from clothjax.storage import canonical_rotation, joint_names, load_body, save_motion
+from clothjax.cli import fail_clearly
+from clothjax.files.storage import canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
 from data_prep.retarget import cmu_names, from_t_pose, stand
-from experiments.session import fail_clearly
 
 # cycles per second, before a seed's own factor
 RATES = {"walk": 0.9, "run": 1.35, "jump": 0.5, "arms": 0.35, "twist": 0.4, "dance": 0.8}

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from clothjax.plausibility import bad_frames
+from clothjax.body.plausibility import bad_frames
 from clothjax.types import Body, Motion
 
 Bad = Literal["keep", "repair", "drop"]

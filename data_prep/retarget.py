@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from clothjax.plausibility import joint_positions
+from clothjax.body.plausibility import joint_positions
 from clothjax.types import Body, Motion
 
 CMU_FROM_SMPL = {

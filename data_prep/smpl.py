@@ -17,9 +17,9 @@ import numpy as np
 import scipy.sparse
 import tyro
 
-from clothjax.storage import UNREADABLE, save_body
+from clothjax.cli import fail_clearly
+from clothjax.files.storage import UNREADABLE, save_body
 from clothjax.types import Body
-from experiments.session import fail_clearly
 
 BODY = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from clothjax import animation
-from clothjax.storage import FACTORS
+from clothjax.files.storage import FACTORS
+from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
 from data_prep.dressing import FOREARM, WINDING, dress, highest_opening, limbs, push_out
 from data_prep.mesh import boundary_loops, compact, components, edge_table
@@ -331,20 +331,20 @@ def draw(path: str | Path, garment: Garment, body: Body) -> None:
     """A picture of the garment on the body from four sides, with pinned vertices as red dots; without the extra
     `render`, none."""
     surfaces = [
-        animation.Surface(np.asarray(body.vertices), np.asarray(body.faces), animation.SKIN),
-        animation.Surface(garment.vertices, garment.faces),
+        ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN),
+        ray_cast.Surface(garment.vertices, garment.faces),
     ]
     dot = trimesh.creation.icosphere(1, 0.006)
     places = garment.vertices[garment.pinned]
     if len(places):
         dots = (places[:, None] + np.asarray(dot.vertices)[None]).reshape(-1, 3)
         faces = (len(dot.vertices) * np.arange(len(places))[:, None, None] + np.asarray(dot.faces)[None]).reshape(-1, 3)
-        surfaces.append(animation.Surface(dots, faces, PINNED))
+        surfaces.append(ray_cast.Surface(dots, faces, PINNED))
     views = ("front", "three-quarter", "side", "back")
     try:
         size = np.ptp(garment.vertices, axis=0)
         margin = 1.2 * max(1.0, 4 / 3 * size[[0, 2]].max() / size[1])
-        pictures = [animation.render(surfaces, animation.camera_for(garment.vertices, view, margin)) for view in views]
-        animation.comparison(path, {"": pictures}, views)
+        pictures = [ray_cast.render(surfaces, ray_cast.camera_for(garment.vertices, view, margin)) for view in views]
+        ray_cast.comparison(path, {"": pictures}, views)
     except ImportError as error:
         print(f"{path}: not drawn ({error})")

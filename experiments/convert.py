@@ -12,8 +12,8 @@
     c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
     safetensors   the arrays alone, for whoever builds a runtime
 
-A JSON beside the file tells how it is driven. The model is specialised first (`clothjax/folding.py`). The distance of
-vertices to jax's unspecialised model, over 300 frames of closed loop, is printed and written into the JSON.
+A JSON beside the file tells how it is driven. The model is specialised first (`clothjax/runtime/specialise.py`).
+The distance of vertices to jax's unspecialised model over a rollout of 300 frames is printed and written to the JSON.
 """
 
 import argparse
@@ -24,11 +24,13 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax import experiment, folding, inference, storage, trained
+from clothjax.cli import fail_clearly, setup
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
-from clothjax.inference import Model
+from clothjax.files import storage
+from clothjax.runtime import inference, specialise, trained
+from clothjax.runtime.inference import Model
+from clothjax.simulation import assembly
 from clothjax.types import Material, Motion
-from experiments.session import fail_clearly, setup
 
 FRAMES = 300
 
@@ -74,9 +76,9 @@ def _batch(given: str) -> int | None:
 
 def convert(model: Model, out: Path, arguments: argparse.Namespace) -> None:
     """Writes the file and its JSON, and says how far it is from the model."""
-    small = folding.specialise(model, blendshapes=arguments.blendshapes, max_influences=arguments.max_influences)
+    small = specialise.specialise(model, blendshapes=arguments.blendshapes, max_influences=arguments.max_influences)
     if arguments.to == "litert" and arguments.int8:
-        small = folding.evened(small)
+        small = specialise.evened(small)
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
     motion = validation(model)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +123,7 @@ def validation(model: Model) -> Motion:
     """The first validation motion that is here, for FRAMES frames."""
     names = [name for name in model.config.evaluation.motions if storage.asset(name).is_file()]
     clip = storage.load_motion(names[0] if names else "walk_3", model.names)
-    clip = experiment.there_and_back(clip, FRAMES)
+    clip = assembly.there_and_back(clip, FRAMES)
     return Motion(clip.rotations, np.asarray(clip.translation - clip.translation[:1], np.float32), clip.fps)
 
 

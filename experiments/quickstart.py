@@ -15,15 +15,18 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from clothjax import configuration, experiment, folding, inference
+from clothjax.cli import fail_clearly, setup
 from clothjax.config import Config
-from clothjax.export.gltf import to_glb
+from clothjax.evaluation import pictures
+from clothjax.evaluation.report import evaluate, table
+from clothjax.evaluation.rollouts import load_run
 from clothjax.export.onnx import run_onnx, to_onnx
+from clothjax.files import configuration
+from clothjax.render.gltf import to_glb
+from clothjax.runtime import inference, specialise
+from clothjax.simulation import assembly
+from clothjax.training.pipeline import run_directory, train
 from clothjax.types import Motion
-from experiments import render
-from experiments.evaluate import evaluate, table
-from experiments.session import fail_clearly, setup
-from experiments.train import load_phi, run_directory, train
 
 CONFIG = str(Path("configs") / "quickstart.yaml")
 ONNX_FRAMES = 100
@@ -38,21 +41,21 @@ def main(argv: list[str]) -> None:
 
     print("measuring against the reference solver")
     report = evaluate(directory, settings=config.evaluation)
-    whole, _ = load_phi(directory, config.evaluation)
+    whole, _ = load_run(directory, config.evaluation)
     motion = config.evaluation.motions[0]
-    betas = experiment.betas(config)
+    betas = assembly.betas(config)
 
     print("exporting and drawing")
     model = inference.load(directory, betas=betas)
-    clip = experiment.motion(whole, motion)
+    clip = assembly.motion(whole, motion)
     origin = clip.translation[0]
     part = Motion(clip.rotations[:ONNX_FRAMES], (clip.translation[:ONNX_FRAMES] - origin).astype(np.float32), clip.fps)
-    onnx = to_onnx(folding.specialise(model), directory / "tshirt.onnx")
+    onnx = to_onnx(specialise.specialise(model), directory / "tshirt.onnx")
     onnx_error = np.linalg.norm(run_onnx(onnx, model, part) - inference.animate(model, part)[0], axis=-1).max()
-    performance = render.perform(directory, whole, motion, config.evaluation.animation_frames)
+    performance = pictures.perform(directory, whole, motion, config.evaluation.animation_frames)
     glb_error = to_glb(directory / "tshirt.glb", performance)
-    render.write_comparison(directory, whole, motion, directory / "comparison.png")
-    render.WRITERS[".webp"](directory / "walk.webp", performance)
+    pictures.write_comparison(directory, whole, motion, directory / "comparison.png")
+    pictures.WRITERS[".webp"](directory / "walk.webp", performance)
 
     report = {
         "quickstart": {

@@ -19,22 +19,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from clothjax import (
-    blendshapes,
-    checkpoint,
-    configuration,
-    experiment,
-    fit,
-    latent_predictor,
-    rollout,
-    stage1,
-    trained,
-    tuning,
-)
-from clothjax.clips import Clips
+from clothjax.body.motion_clips import Clips
+from clothjax.cli import fail_clearly, setup
 from clothjax.config import Config
-from experiments.session import fail_clearly, progress, setup
-from experiments.train import PHYSICS
+from clothjax.files import checkpoint, configuration
+from clothjax.networks import animators, psi
+from clothjax.progress import progress_bar
+from clothjax.runtime import trained
+from clothjax.simulation import assembly
+from clothjax.training import fine_tuning, laplacian_shapes, loop, pool, stage1
+from clothjax.training.pipeline import PHYSICS
 
 
 def main(argv: list[str]) -> None:
@@ -45,7 +39,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument(
         "--allowed",
         type=int,
-        default=fit.MAX_NONFINITE,
+        default=loop.MAX_NONFINITE,
         help="skipped steps in a row to put up with; default: as training",
     )
     arguments = parser.parse_args(argv)
@@ -68,13 +62,13 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
     total = getattr(config, stage).steps
     if found.step >= total:
         raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
     update, turn, state = _again(run, stage, whole, reel)
     state, _ = checkpoint.restore(start, state)
     print(f"from step {found.step} of {start}", flush=True)
     end, skipped = min(found.step + steps, total), 0
-    with progress("replaying", end - found.step) as report:
+    with progress_bar("replaying", end - found.step) as report:
         for step in range(found.step, end):
             before = jax.device_get(state)
             state, metrics = update(state)
@@ -82,7 +76,7 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
             if not skipped:
                 first = step, before, metrics
             try:
-                skipped = fit.check_finite(metrics, step, skipped, allowed)
+                skipped = loop.check_finite(metrics, step, skipped, allowed)
             except FloatingPointError as error:
                 step, before, metrics = first
                 kept = run / stage / "diverged" / str(step)
@@ -105,22 +99,24 @@ def _start(folder: Path) -> tuple[Path, checkpoint.Checkpoint]:
 
 
 def _again(
-    run: Path, stage: str, whole: experiment.Experiment, reel: Clips
+    run: Path, stage: str, whole: assembly.Experiment, reel: Clips
 ) -> tuple[Callable, Callable, stage1.TrainingState]:
     """The training step of a stage, what tells the simulations of a step, and a state."""
     config = whole.config
-    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    kept = psi.input_joints(whole.names, config.stage2)
     if stage == "tuning":
         _, garment, predictor, normalizers = trained.psi(run)
         phi = trained.phi(run)[1]["params"]
-        animator = tuning.psi(garment, normalizers, kept, tuning.preconditioners(whole, reel, phi, normalizers, kept))
-        config = tuning.settings(config)
-        state = tuning.init(predictor, whole.scene, reel, whole.config)
+        animator = animators.psi_animator(
+            garment, normalizers, kept, fine_tuning.preconditioners(whole, reel, phi, normalizers, kept)
+        )
+        config = fine_tuning.settings(config)
+        state = fine_tuning.init(predictor, whole.scene, reel, whole.config)
     elif config.peer.network:
-        animator = rollout.peer(kept)
-        state = stage1.init_peer(whole.scene, reel, kept, blendshapes.laplacian(whole.scene, config), config)
+        animator = animators.baseline_animator(kept)
+        state = stage1.init_peer(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
     else:
-        animator, state = rollout.phi, stage1.init(whole.scene, reel, config)
+        animator, state = animators.phi_animator, stage1.init(whole.scene, reel, config)
 
     @partial(jax.jit, static_argnums=2)
     def turn(state: stage1.TrainingState, reel: Clips, frames: int):
@@ -132,16 +128,14 @@ def _again(
 
 def _said(
     step: int,
-    metrics: fit.Metrics,
-    simulations: tuple[np.ndarray, stage1.Simulation],
-    whole: experiment.Experiment,
+    metrics: loop.Metrics,
+    simulations: tuple[np.ndarray, pool.Simulation],
+    whole: assembly.Experiment,
 ) -> str:
     """A bad step for a reader."""
     wrong = [name for name, values in metrics.items() if not np.isfinite(values[0])]
     lines = [f"step {step + 1}: not finite: {', '.join(wrong)}"]
-    clips = {
-        name: len(experiment.motion(whole, name).translation) for name in experiment.training_motions(whole.config)
-    }
+    clips = {name: len(assembly.motion(whole, name).translation) for name in assembly.training_motions(whole.config)}
     begin = np.concatenate([[0], np.cumsum(list(clips.values()))])
     numbers, of_them = jax.device_get(simulations)
     for index, number in enumerate(numbers):

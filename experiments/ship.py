@@ -12,10 +12,10 @@ import shutil
 import sys
 from pathlib import Path
 
-from clothjax import trained
-from clothjax.run_folder import add_seconds, read_seconds
-from experiments.evaluate import pretrained, table
-from experiments.session import fail_clearly, setup
+from clothjax.cli import fail_clearly, setup
+from clothjax.evaluation.report import evaluate_packed, table
+from clothjax.runtime import trained
+from clothjax.training.run_folder import add_seconds, read_seconds
 
 
 def main(argv: list[str]) -> None:
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> None:
             "seed": config.stage1.seed,
             "hours": seconds / 3600,
         }
-    reports = pretrained({arguments.name: packed})
+    reports = evaluate_packed({arguments.name: packed})
     (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT):

@@ -19,10 +19,13 @@ from pathlib import Path
 
 import submitit
 
-from clothjax import configuration, trained
+from clothjax.cli import fail_clearly, setup
 from clothjax.config import Config
-from experiments import evaluate, train
-from experiments.session import fail_clearly, progress, setup
+from clothjax.evaluation.report import evaluate
+from clothjax.files import configuration
+from clothjax.progress import progress_bar
+from clothjax.runtime import trained
+from experiments import train
 
 COLUMNS = ("energy_gap", "hold_gap", "penetration_percent", "jitter", "ms_per_frame")
 
@@ -40,7 +43,7 @@ class Job(submitit.helpers.Checkpointable):
         else:
             train.main([*arguments, "--directory", directory])
             partial = report.with_suffix(".partial")
-            partial.write_text(json.dumps(evaluate.evaluate(run), indent=1) + "\n")
+            partial.write_text(json.dumps(evaluate(run), indent=1) + "\n")
             partial.replace(report)
         return json.loads(report.read_text())["evaluation"]
 
@@ -99,7 +102,7 @@ def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, 
         finally:
             slots.put(gpu)
 
-    with ThreadPoolExecutor(len(places)) as pool, progress("jobs", len(jobs)) as report:
+    with ThreadPoolExecutor(len(places)) as pool, progress_bar("jobs", len(jobs)) as report:
         waiting = {pool.submit(run, job): name for name, job in jobs.items()}
         try:
             for done, future in enumerate(as_completed(waiting), 1):

@@ -24,21 +24,26 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
-from clothjax import animation, checkpoint, configuration, experiment, inference, storage, trained
+from clothjax.cli import fail_clearly, setup
 from clothjax.config import Config
-from clothjax.inference import Bounds, Model
+from clothjax.evaluation import pictures
+from clothjax.evaluation.report import evaluate
+from clothjax.evaluation.rollouts import load_run
+from clothjax.files import checkpoint, configuration, storage
+from clothjax.render import ray_cast
+from clothjax.runtime import inference, trained
+from clothjax.runtime.inference import Bounds, Model
+from clothjax.simulation import assembly
+from clothjax.training.pipeline import train
 from clothjax.types import Pose
-from data_prep import garment as garments
-from experiments import gallery, render
-from experiments.benchmarks import pareto
-from experiments.evaluate import evaluate
-from experiments.session import fail_clearly, setup
-from experiments.train import load_phi, train
+from data_prep import garment as garment_module
+from data_prep.garment import Arguments
+from experiments.benchmark import pareto
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 GARMENTS = ("tshirt", "longsleeve", "tank", "pants", "dress")
 VERTICES = 1000
@@ -116,7 +121,7 @@ def cloth(name: str, folder: Path) -> str:
     path = folder / "garments" / f"{name}.h5"
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        garments.main(garments.Arguments(path, template=name, vertices=VERTICES))
+        garment_module.main(Arguments(path, template=name, vertices=VERTICES))
     return str(path)
 
 
@@ -169,8 +174,8 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
             with np.load(run / f"trajectories_{Path(motion).stem}.npz") as file:
                 tracks |= {name: file[name] for name in file.files if name not in ("lbs", "solver")}
                 solver = file["solver"]
-        whole = experiment.assemble(config)
-        rows, columns = render.at_moments(whole, motion, tracks | {"solver": solver}, MOMENTS)
+        whole = assembly.assemble(config)
+        rows, columns = pictures.at_moments(whole, motion, tracks | {"solver": solver}, MOMENTS)
         parts.append(f"<h3>{garment}</h3>" + table(figures[garment]) + sheet(rows, columns))
     text = (
         "<p>Every network in its own closed loop on a motion and a body that none has seen. A gap of 0 is the solver, "
@@ -186,7 +191,7 @@ def shapes(runs: Runs) -> tuple[dict, Section]:
         if "ours" in of_it:
             config = trained.phi(of_it["ours"])[0]
             parts.append(
-                f"<h3>{garment}</h3>" + sheet(*gallery.pictures(of_it["ours"], config.evaluation.motions[:1], FRAME))
+                f"<h3>{garment}</h3>" + sheet(*pictures.gallery(of_it["ours"], config.evaluation.motions[:1], FRAME))
             )
     text = "<p>One network for all bodies: thin, mean and heavy, at the same frame.</p>"
     return {}, ("Figure 6: bodies", text + "".join(parts))
@@ -204,7 +209,7 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
         motion = config.evaluation.motions[0]
         with np.load(of_it[key] / f"trajectories_{Path(motion).stem}.npz") as file:
             tracks |= {stage: file[stage], "solver": file["solver"]}
-    rows, columns = render.at_moments(experiment.assemble(config), motion, tracks, MOMENTS)
+    rows, columns = pictures.at_moments(assembly.assemble(config), motion, tracks, MOMENTS)
     text = "<p>Predictor, decoder and blend shapes trained on the losses alone, for the same time.</p>"
     return figures, (title, text + table(figures) + sheet(rows, columns))
 
@@ -216,12 +221,12 @@ def failure(runs: Runs) -> tuple[dict, Section]:
     if garment is None:
         return {}, (title, "<p>Needs a run of ours.</p>")
     run = runs[garment]["ours"]
-    whole, _ = load_phi(run)
-    model = inference.load(run, betas=experiment.betas(whole.config))
+    whole, _ = load_run(run)
+    model = inference.load(run, betas=assembly.betas(whole.config))
     everywhere = Bounds(*(jnp.full_like(model.network.first, x) for x in (-1e9, 1e9, 0.0)))
     free = dataclasses.replace(model, network=model.network._replace(code_bounds=everywhere))
     motion = whole.config.evaluation.motions[0]
-    clip = experiment.motion(whole, motion)
+    clip = assembly.motion(whole, motion)
     poses = Pose(jnp.asarray(clip.rotations, jnp.float32), jnp.asarray(clip.translation, jnp.float32))
     sound = broken(model, poses, 0.0)
     tracks = {"as it is": broken(model, poses, FARNESS), "without bounds": broken(free, poses, FARNESS)}
@@ -231,12 +236,12 @@ def failure(runs: Runs) -> tuple[dict, Section]:
         axis.semilogy(np.arange(len(values)) - BROKEN, np.maximum(values, 1e-3), label=name)
     axis.set(xlabel="frames since the code was broken", ylabel="mm from the undisturbed garment")
     axis.legend()
-    body, _ = render.body_trajectory(whole, clip)
+    body, _ = pictures.body_trajectory(whole, clip)
     moments = [BROKEN, BROKEN + 3, BROKEN + 10, BROKEN + 40]
-    camera = animation.camera_for(body[np.array(moments) - 1])
+    camera = ray_cast.camera_for(body[np.array(moments) - 1])
     rows = {
         name: [
-            animation.render(render.dressed(whole, body[t - 1], track[t] - clip.translation[t]), camera, render.SIZE)
+            ray_cast.render(pictures.dressed(whole, body[t - 1], track[t] - clip.translation[t]), camera, pictures.SIZE)
             for t in moments
         ]
         for name, track in (tracks | {"undisturbed": sound}).items()
@@ -343,7 +348,7 @@ def table(rows: dict[str, dict], columns: dict[str, str] = MEASURES) -> str:
 def sheet(rows: dict[str, list[np.ndarray]], columns: list[str]) -> str:
     """Pictures in rows and columns."""
     buffer = io.BytesIO()
-    animation.comparison(buffer, rows, columns)
+    ray_cast.comparison(buffer, rows, columns)
     return picture(buffer.getvalue())
 
 

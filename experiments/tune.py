@@ -16,10 +16,14 @@ from pathlib import Path
 
 import jax
 
-from clothjax import configuration, experiment, latent_predictor, stage2, trained
+from clothjax.cli import fail_clearly, setup
 from clothjax.config import Config
-from experiments.session import fail_clearly, setup
-from experiments.train import tune
+from clothjax.files import configuration
+from clothjax.networks import normalisation, psi
+from clothjax.runtime import trained
+from clothjax.simulation import assembly
+from clothjax.training import stage2
+from clothjax.training.pipeline import fine_tune
 
 
 def main(argv: list[str]) -> None:
@@ -33,12 +37,12 @@ def main(argv: list[str]) -> None:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
     _, garment, predictor, normalizers = trained.psi(folder)
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
-    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
+    kept = psi.input_joints(whole.names, config.stage2)
     seen = stage2.ordinary_poses(whole.scene, reel, kept, config)
-    normalizers = normalizers._replace(pose=latent_predictor.widened(normalizers.pose, seen))
-    tuned = tune(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
+    normalizers = normalizers._replace(pose=normalisation.widened(normalizers.pose, seen))
+    tuned = fine_tune(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
     made = trained.made(folder)
     command = shlex.join(["python", "-m", "experiments.tune", *argv])

@@ -23,8 +23,9 @@ WORDS = (b"nan", b"inf", b"-1", b"0", b"1e999", b"99999999999", b"", b"x", b"{",
 
 def readers() -> dict:
     """What reads each kind of file, by the name that the file has."""
-    from clothjax import checkpoint, configuration, storage, trained
     from clothjax.config import Config
+    from clothjax.files import checkpoint, configuration, storage
+    from clothjax.runtime import trained
     from data_prep import amass, asf_amc, bvh, smpl, user_mesh
 
     return {

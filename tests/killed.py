@@ -3,11 +3,11 @@
 import sys
 from functools import partial
 
-from clothjax import fit
+from clothjax.cli import setup
+from clothjax.training import loop
 from experiments import train
-from experiments.session import setup
 
 if __name__ == "__main__":
     setup()
-    fit.fit = partial(fit.fit, checkpoint_seconds=0.0)
+    loop.fit = partial(loop.fit, checkpoint_seconds=0.0)
     train.main(sys.argv[1:])

@@ -9,10 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from clothjax import animation
-from clothjax.animation import Surface
-from clothjax.export import gltf, point_cache, usd
-from clothjax.export.performance import Part, Performance
+from clothjax.render import gltf, point_cache, ray_cast, usd
+from clothjax.render.performance import Part, Performance
+from clothjax.render.ray_cast import Surface
 
 
 def sheet(count: int = 12):
@@ -27,41 +26,41 @@ def test_what_is_in_front_hides_what_is_behind():
     vertices, faces = sheet()
     red = Surface(vertices + [0, 0, 0.01], faces, (1.0, 0.0, 0.0))
     blue = Surface(vertices - [0, 0, 0.01], faces, (0.0, 0.0, 1.0))
-    camera = animation.camera_for(vertices, "front")
+    camera = ray_cast.camera_for(vertices, "front")
     for order in ([red, blue], [blue, red]):
-        centre = animation.render(order, camera, (60, 60))[30, 30]
+        centre = ray_cast.render(order, camera, (60, 60))[30, 30]
         assert centre[0] > 4 * centre[2].astype(int)
-    centre = animation.render([red, blue], animation.camera_for(vertices, "back"), (60, 60))[30, 30]
+    centre = ray_cast.render([red, blue], ray_cast.camera_for(vertices, "back"), (60, 60))[30, 30]
     assert centre[2] > 4 * centre[0].astype(int)
 
 
 def test_the_camera_frames_its_subject():
     vertices, faces = sheet()
-    picture = animation.render([Surface(vertices, faces)], animation.camera_for(vertices, "front"), (100, 100))
+    picture = ray_cast.render([Surface(vertices, faces)], ray_cast.camera_for(vertices, "front"), (100, 100))
     rows = np.flatnonzero((picture != picture[0, 0]).any(axis=(1, 2)))
     assert 2 <= rows[0] <= 12 and 87 <= rows[-1] <= 97
 
 
 def test_an_unknown_view_is_refused():
     with pytest.raises(ValueError, match="view 'top' is not one of"):
-        animation.camera_for(np.zeros((3, 3)), "top")
+        ray_cast.camera_for(np.zeros((3, 3)), "top")
 
 
 def test_a_shadow_falls_on_the_floor():
     vertices, faces = sheet()
-    camera = animation.camera_for(np.concatenate([vertices, vertices + [0, 0, -2.0]]), "three-quarter", 2.5)
-    plain = animation.render([Surface(vertices + 50, faces)], camera, (80, 80), floor=-0.6).astype(int)
-    dark = animation.render([Surface(vertices, faces)], camera, (80, 80), floor=-0.6).astype(int)
+    camera = ray_cast.camera_for(np.concatenate([vertices, vertices + [0, 0, -2.0]]), "three-quarter", 2.5)
+    plain = ray_cast.render([Surface(vertices + 50, faces)], camera, (80, 80), floor=-0.6).astype(int)
+    dark = ray_cast.render([Surface(vertices, faces)], camera, (80, 80), floor=-0.6).astype(int)
     below = (plain.sum(-1) - dark.sum(-1))[60:]
     assert (below > 60).any()
 
 
 def test_comparison_and_webp_hold_every_picture(tmp_path):
     pictures = [np.full((20, 30, 3), 40 * k, np.uint8) for k in range(4)]
-    animation.comparison(tmp_path / "c.png", {"one": pictures[:2], "two": pictures[2:]}, ["a", "b"])
+    ray_cast.comparison(tmp_path / "c.png", {"one": pictures[:2], "two": pictures[2:]}, ["a", "b"])
     sheet_picture = np.asarray(Image.open(tmp_path / "c.png"))
     assert all((sheet_picture == 40 * k).all(-1).sum() >= 20 * 30 for k in range(4))
-    animation.webp(tmp_path / "w.webp", pictures, 30)
+    ray_cast.webp(tmp_path / "w.webp", pictures, 30)
     assert Image.open(tmp_path / "w.webp").n_frames == 4
 
 
@@ -73,7 +72,7 @@ def flag():
     waving = vertices + np.array([0, 0, 0.1]) * np.sin(time + 4 * vertices[:, :1])
     still = np.repeat(vertices[None] - [0, 0, 0.5], 20, axis=0) + 1e-3 * np.sin(time)
     root = np.stack([np.linspace(0, 1, 20), np.zeros(20), np.zeros(20)], -1)
-    parts = (Part("body", still, faces, animation.SKIN), Part("garment", waving, faces, animation.CLOTH))
+    parts = (Part("body", still, faces, ray_cast.SKIN), Part("garment", waving, faces, ray_cast.CLOTH))
     return Performance(parts, root, 30.0)
 
 
@@ -176,7 +175,7 @@ def test_mp4_plays_what_was_drawn(tmp_path):
     import av
 
     pictures = [np.full((48, 64, 3), 20 * k, np.uint8) for k in range(12)]
-    animation.mp4(tmp_path / "f.mp4", pictures, 30.0)
+    ray_cast.mp4(tmp_path / "f.mp4", pictures, 30.0)
     with av.open(str(tmp_path / "f.mp4")) as film:
         assert float(film.streams.video[0].average_rate) == 30
         found = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]

@@ -20,10 +20,14 @@ from test_data_prep import AMC, ASF, BVH
 from test_smpl import recording
 from toy import small
 
-from clothjax import checkpoint, configuration, inference, run_folder, storage, trained
+from clothjax.cli import fail_clearly
+from clothjax.files import checkpoint, configuration, storage
+from clothjax.runtime import inference, trained
+from clothjax.training import run_folder
 from data_prep import amass, asf_amc, bvh, garment, smpl
-from experiments import benchmark, convert, demo, evaluate, gallery, quickstart, render, sweep, thesis, train, tune
-from experiments.session import fail_clearly
+from experiments import convert, evaluate, gallery, quickstart, render, sweep, thesis, train, tune
+from experiments.benchmark import report
+from experiments.demo import viewer
 
 CASES: dict = {}
 
@@ -581,12 +585,12 @@ def a_garment_to_tune_that_is_not_there(folder):
 @case(r"old\.json", "not a report")
 def a_benchmark_compared_with_something_else(folder):
     (folder / "old.json").write_text("[]")
-    return lambda: benchmark.main(["--quick", "--compare", str(folder / "old.json")])
+    return lambda: report.main(["--quick", "--compare", str(folder / "old.json")])
 
 
 @case("runs are for the part pareto")
 def a_run_for_a_part_that_takes_none(folder):
-    return lambda: benchmark.main(["skirt", "--part", "stage1"])
+    return lambda: report.main(["skirt", "--part", "stage1"])
 
 
 @case("hat_1000", "tshirt_1000")
@@ -601,7 +605,7 @@ def a_report_without_runs(folder):
 
 @case("none.h5|no such")
 def a_clip_for_the_demo_that_is_not_there(folder):
-    return lambda: demo.main(["--motions", str(folder / "none.h5"), "--frames", "1"])
+    return lambda: viewer.main(["--motions", str(folder / "none.h5"), "--frames", "1"])
 
 
 @case("quickstart.yaml|latent", "sizes must be > 0")
@@ -647,7 +651,7 @@ from test_bad_input import settings
 from pathlib import Path
 from clothjax import checkpoint, fit
 from experiments import train
-from experiments.session import fail_clearly
+from clothjax.cli import fail_clearly
 save = checkpoint.save
 def onto_a_full_disk(directory, step, *args, **options):
     if Path(directory).parent.name == "stage2" and step > int(sys.argv[2]):

@@ -11,11 +11,22 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import configuration
 from clothjax.config import Config
 from clothjax.export import native
-from experiments import benchmark
-from experiments.benchmarks import comparison, inference, peers, scaling, scenes, stage1, timing
+from clothjax.files import configuration
+from experiments.benchmark import (
+    comparison,
+    inference,
+    peers,
+    scaling,
+    scenes,
+    stage1,
+    timing,
+)
+from experiments.benchmark import (
+    report as benchmark_report,
+)
+from experiments.benchmark.report import PAPER, PARTS, QUICK, main
 
 
 @pytest.mark.slow
@@ -27,12 +38,12 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
         model=dataclasses.replace(config.model, body_nodes="updated", latent_update="absolute"),
         physics=dataclasses.replace(config.physics, contact_surface="centroids", edge_contact=False),
     )
-    monkeypatch.setattr(benchmark.configuration, "cli", lambda *_: config)
+    monkeypatch.setattr(configuration, "cli", lambda *_: config)
     monkeypatch.setattr(stage1, "CONVOLUTION", (3, 4))
     monkeypatch.setattr(scaling, "SIZES", (300, 400))
-    monkeypatch.setattr(benchmark, "ROUNDS", 3)
+    monkeypatch.setattr(benchmark_report, "ROUNDS", 3)
     monkeypatch.setattr(scenes, "SCENES", {name: scenes.SCENES[name] for name in ("full", "no_bending")})
-    benchmark.main(["--part", "stage1", "--json", str(tmp_path / "b.json")])
+    main(["--part", "stage1", "--json", str(tmp_path / "b.json")])
     report = json.loads((tmp_path / "b.json").read_text())
     assert json.dumps(report, indent=1) in capsys.readouterr().out
     figures = report["stage1"]
@@ -55,8 +66,8 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_parts_of_inference(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark.inference, "one_thread", lambda: None)  # this process has other tests to run
-    benchmark.main(["--part", "inference", "--quick", "--json", str(tmp_path / "b.json")])
+    monkeypatch.setattr(inference, "one_thread", lambda: None)  # this process has other tests to run
+    main(["--part", "inference", "--quick", "--json", str(tmp_path / "b.json")])
     figures = json.loads((tmp_path / "b.json").read_text())["inference"]
     assert (tmp_path / "b.inference.png").exists()
     variants = {each["name"]: each for each in figures["variants"]}
@@ -138,18 +149,18 @@ def test_all_parts_are_run_and_put_together(tmp_path, monkeypatch):
         Path(command[command.index("--json") + 1]).write_text(json.dumps({"machine": {}, part: {"us": 1.0}}))
         return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr(benchmark.subprocess, "run", run)
-    benchmark.main(["skirt", "--quick", "--json", str(tmp_path / "b.json")])
+    monkeypatch.setattr(subprocess, "run", run)
+    main(["skirt", "--quick", "--json", str(tmp_path / "b.json")])
     report = json.loads((tmp_path / "b.json").read_text())
-    assert set(report) == {"machine", *benchmark.PARTS} and all("--quick" in command for command in ran)
+    assert set(report) == {"machine", *PARTS} and all("--quick" in command for command in ran)
     assert ["skirt" in command for command in ran] == [False, False, True]
-    monkeypatch.setattr(benchmark.subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, 1))
+    monkeypatch.setattr(subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, 1))
     with pytest.raises(ValueError, match="the part stage1 failed"):
-        benchmark.main(["--json", str(tmp_path / "b.json")])
+        main(["--json", str(tmp_path / "b.json")])
 
 
 def test_the_configurations_measured_are_valid():
-    for arguments in (benchmark.PAPER, benchmark.QUICK):
+    for arguments in (PAPER, QUICK):
         assert configuration.cli(Config, arguments).model.body_nodes == "updated"
 
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from test_documents import SMALL, commands, run, workplace  # noqa: F401
 
-from clothjax import storage
+from clothjax.files import storage
 
 
 def cape() -> trimesh.Trimesh:

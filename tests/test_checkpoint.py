@@ -14,7 +14,7 @@ import numpy as np
 import optax
 import pytest
 
-from clothjax import checkpoint
+from clothjax.files import checkpoint
 
 
 class State(NamedTuple):

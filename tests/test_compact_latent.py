@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import compact_latent
+from clothjax.physics import descent
 
 START = jnp.array([0.3, -1.0, 0.7])
 GOAL = jnp.array([1.0, 0.0, -2.0])
 
 
 def descend(inverse, start, decode, potential, steps=1, bound=1e6):
-    return compact_latent.descend(lambda g: inverse @ g, start, decode, potential, steps, bound)
+    return descent.descend(lambda g: inverse @ g, start, decode, potential, steps, bound)
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def coded():
         return jnp.sum((positions - goal) ** 2)
 
     return (
-        compact_latent.inverted(compact_latent.hessian(lambda z: potential(decode(z)), jnp.zeros(3)), 1e-9),
+        descent.regularised_inverse(descent.hessian(lambda z: potential(decode(z)), jnp.zeros(3)), 1e-9),
         decode,
         potential,
     )
@@ -46,9 +46,9 @@ def test_one_step_reaches_the_minimum_of_a_quadratic(coded):
 def test_the_descent_begins_where_the_code_is_going_unless_that_is_worse(coded):
     _, decode, potential = coded
     nearer, farther = 0.3 * (GOAL - START), 3.0 * (GOAL - START)
-    np.testing.assert_array_equal(compact_latent.onward(START, nearer, decode, potential), START + nearer)
-    np.testing.assert_array_equal(compact_latent.onward(START, farther, decode, potential), START)
-    np.testing.assert_array_equal(compact_latent.onward(START, jnp.full(3, jnp.nan), decode, potential), START)
+    np.testing.assert_array_equal(descent.warm_start(START, nearer, decode, potential), START + nearer)
+    np.testing.assert_array_equal(descent.warm_start(START, farther, decode, potential), START)
+    np.testing.assert_array_equal(descent.warm_start(START, jnp.full(3, jnp.nan), decode, potential), START)
 
 
 def test_steps_are_conjugate():
@@ -100,4 +100,4 @@ def test_a_softer_cloth_goes_farther(coded):
     done = descend(inverse, START, decode, lambda x: potential(x) / 3)
     np.testing.assert_allclose(done, GOAL, atol=1e-4)
     done = descend(inverse, START, decode, lambda x: potential(x) / 400)
-    np.testing.assert_allclose(done - START, compact_latent.MAX_LENGTH / 400 * (GOAL - START), rtol=1e-3)
+    np.testing.assert_allclose(done - START, descent.MAX_LENGTH / 400 * (GOAL - START), rtol=1e-3)

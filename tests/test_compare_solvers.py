@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import physics
-from experiments import compare_solvers as compare
-from experiments import engines
-from experiments.engines import CONFIG, MATERIAL, SCENES
+from clothjax.physics import energies
+from experiments.compare_solvers import engines, report
+from experiments.compare_solvers.engines import CONFIG, MATERIAL, SCENES
 
 DT = 1 / 120
 
@@ -26,7 +25,7 @@ def stretching(law, strain):
 
 
 def test_newtons_membrane_is_ours_to_second_order():
-    ours, newtons = physics.stretching, engines.neo_hookean
+    ours, newtons = energies.stretching, engines.neo_hookean
     with jax.enable_x64(True):
         zero = jnp.zeros((2, 2))
         assert abs(stretching(newtons, zero)) < 1e-15
@@ -39,7 +38,7 @@ def test_newtons_membrane_is_ours_to_second_order():
 
 
 def test_contacts_are_as_deep_under_a_vertex():
-    weight = physics.GRAVITY * MATERIAL.density * engines.SIZE**2 / 100
+    weight = energies.GRAVITY * MATERIAL.density * engines.SIZE**2 / 100
     depth = np.sqrt(weight / (3 * CONFIG.collision_stiffness))
     assert engines.contact_stiffness(100) * depth == pytest.approx(weight)
     with jax.enable_x64(True):
@@ -56,7 +55,7 @@ def test_scenes(name):
     assert len(scene.flat) == 36 and len(scene.mesh.faces) == 50
     assert scene.pinned.sum() == {"hang": 6, "edge": 6, "corners": 2, "sphere": 0}[name]
     step = engines.Reference(scene, DT).time_step()
-    terms = compare.energies(scene, scene.start)
+    terms = report.energies(scene, scene.start)
     assert terms["stretching"] < 1e-12 and terms["gravity"] == terms["collision"] == 0
     np.testing.assert_allclose(step.mass.sum(), MATERIAL.density * engines.SIZE**2, rtol=1e-6)
 
@@ -74,21 +73,21 @@ def test_our_pins_carry_the_weight_at_rest():
     engine = engines.Reference(scene, 1e3)  # a step so long that there is no inertia
     engine.advance()
     assert engine.converged
-    assert compare.pins(scene, engine.position) == pytest.approx(1, abs=1e-5)
+    assert report.pins(scene, engine.position) == pytest.approx(1, abs=1e-5)
 
 
 def test_newtons_energies_are_put_back():
-    ours = physics.stretching, physics.collision
+    ours = energies.stretching, energies.collision
     with engines.newtons_energies():
-        assert physics.stretching is engines.neo_hookean and physics.collision is engines.quadratic
-    assert (physics.stretching, physics.collision) == ours
+        assert energies.stretching is engines.neo_hookean and energies.collision is engines.quadratic
+    assert (energies.stretching, energies.collision) == ours
 
 
 def test_distances():
     one = np.zeros((2, 3, 3))
     other = one.copy()
     other[0, 0, 0], other[1, :, 1] = 3e-3, 1e-3
-    assert compare.distances(one, other) == pytest.approx(
+    assert report.distances(one, other) == pytest.approx(
         {"mean_mm": 1.0, "max_mm": 3.0, "end_mean_mm": 1.0, "end_max_mm": 1.0}
     )
 
@@ -110,6 +109,6 @@ def test_ours_and_newtons_take_the_same_steps(name):
     scene = engines.scene(name, 8)
     newton = engines.Vbd(scene, DT, 100)
     with engines.newtons_energies():
-        tracks, _ = compare.simulate({"ours": engines.Reference(scene, DT), "newton": newton}, 4, 4)
+        tracks, _ = report.simulate({"ours": engines.Reference(scene, DT), "newton": newton}, 4, 4)
     assert np.abs(tracks["ours"][-1] - scene.start).max() > 0.03
-    assert compare.distances(tracks["ours"], tracks["newton"])["max_mm"] < 0.05
+    assert report.distances(tracks["ours"], tracks["newton"])["max_mm"] < 0.05

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from toy import shrink
 
-from clothjax import blendshapes, configuration, experiment, latent_predictor, rollout, stage1
 from clothjax.config import Config
+from clothjax.files import configuration
+from clothjax.networks import animators, psi
+from clothjax.simulation import assembly
+from clothjax.training import laplacian_shapes, stage1
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 # like the quickstart, the same program on another mesh; what tests/test_peers.py has; one of a minute and a half
@@ -20,12 +23,12 @@ LONG = ("pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_t
 def test_every_configuration_takes_two_steps(path):
     config = shrink(configuration.load(Config, path))
     config = dataclasses.replace(config, motions=("walk_0",))
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
     if config.peer.network:
-        kept = latent_predictor.kept_joints(whole.names, config.stage2)
-        state = stage1.init_peer(whole.scene, reel, kept, blendshapes.laplacian(whole.scene, config), config)
-        update = stage1.make_curriculum(whole.scene, reel, config, 2, animator=rollout.peer(kept))
+        kept = psi.input_joints(whole.names, config.stage2)
+        state = stage1.init_peer(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
+        update = stage1.make_curriculum(whole.scene, reel, config, 2, animator=animators.baseline_animator(kept))
     else:
         state = stage1.init(whole.scene, reel, config)
         update = stage1.make_curriculum(whole.scene, reel, config, 2)

@@ -6,7 +6,9 @@ from typing import Literal
 
 import pytest
 
-from clothjax import config, configuration
+from clothjax import config as config_module
+from clothjax.config import TuningConfig
+from clothjax.files import configuration
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ def test_round_trip_through_json():
     "edges, level", [(("mesh",), 0), (("coarse0", "mesh"), 0), (("coarse0", "coarse1"), 1), (("coarse1",), 2)]
 )
 def test_the_vertices_that_a_stack_reaches(edges, level):
-    assert config.Stack(edges, 1).lowest_level == level
+    assert config_module.Stack(edges, 1).lowest_level == level
 
 
 @pytest.mark.parametrize(
@@ -213,4 +215,4 @@ def test_the_vertices_that_a_stack_reaches(edges, level):
 )
 def test_tuning_refuses_what_it_would_ignore(setting, said):
     with pytest.raises(ValueError, match=said):
-        config.TuningConfig(steps=10, **setting)
+        TuningConfig(steps=10, **setting)

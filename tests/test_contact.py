@@ -9,9 +9,12 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from clothjax import character as characters
-from clothjax import clips, contact, experiment, losses, proximity, rollout, skinning, topology
+from clothjax import material
+from clothjax.body import motion_clips, skinning
 from clothjax.config import Config
+from clothjax.geometry import proximity, topology
+from clothjax.physics import contact_search, incremental_potential
+from clothjax.simulation import assembly, characters, time_step
 from clothjax.types import Pose
 
 
@@ -40,7 +43,7 @@ def icosphere(rounds=2, radius=1.0):
 
 def test_centroids_of_faces():
     vertices, faces = icosphere()
-    points, normals = contact.centroids(vertices.astype(np.float32), faces)
+    points, normals = contact_search.centroids(vertices.astype(np.float32), faces)
     for face, point, normal in zip(faces[::17], points[::17], normals[::17]):
         a, b, c = vertices[face]
         np.testing.assert_allclose(point, (a + b + c) / 3, atol=1e-6)
@@ -62,8 +65,8 @@ def test_the_signed_distance_is_that_of_libigl(kind):
     vertices, faces = body(kind, random)
     positions = random.uniform(-1.2, 1.2, (2000, 3)).astype(np.float32)
     patches = proximity.patches(vertices, faces)
-    found = jax.jit(contact.find)(positions, vertices, vertices, patches)
-    distance = contact.distance(positions, found.point, found.normal)
+    found = jax.jit(contact_search.find)(positions, vertices, vertices, patches)
+    distance = contact_search.distance(positions, found.point, found.normal)
     expected = igl.signed_distance(
         positions.astype(np.float64), vertices.astype(np.float64), faces.astype(np.int64),
         sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
@@ -90,21 +93,23 @@ def test_the_surface_goes_on_a_little_where_the_body_was_cut():
     height = np.float32([1e-3, -1e-3, 5e-3, -5e-3, 0.0])
     for x, z in ((0.108, 0.01), (0.105, 0.105), (0.0, -0.108)):
         positions = np.stack([np.full(5, x), height, np.full(5, z)], axis=1).astype(np.float32)
-        found = contact.find(positions, flat, flat, patches)
-        np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), height, atol=1e-7)
+        found = contact_search.find(positions, flat, flat, patches)
+        np.testing.assert_allclose(contact_search.distance(positions, found.point, found.normal), height, atol=1e-7)
         np.testing.assert_allclose(found.normal_next, np.tile([[0, 1, 0]], (5, 1)), atol=1e-6)
     for x, z in ((0.13, 0.01), (0.13, 0.13), (0.0, -0.3)):
         positions = np.stack([np.full(5, x), height, np.full(5, z)], axis=1).astype(np.float32)
-        found = contact.find(positions, flat, flat, patches)
+        found = contact_search.find(positions, flat, flat, patches)
         away = np.linalg.norm(positions - np.clip(positions, -0.1, 0.1) * [1, 0, 1], axis=1)
-        np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), away, rtol=1e-5)
+        np.testing.assert_allclose(contact_search.distance(positions, found.point, found.normal), away, rtol=1e-5)
 
 
 def test_behind_an_open_sheet_is_inside():
     flat, faces = sheet(12)
     positions = np.float32([[0.02, -0.03, 0.01], [0.02, 0.03, 0.01], [-0.05, -0.015, 0.06]])
-    found = contact.find(positions, flat, flat, proximity.patches(flat, faces))
-    np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), [-0.03, 0.03, -0.015], atol=1e-6)
+    found = contact_search.find(positions, flat, flat, proximity.patches(flat, faces))
+    np.testing.assert_allclose(
+        contact_search.distance(positions, found.point, found.normal), [-0.03, 0.03, -0.015], atol=1e-6
+    )
 
 
 def test_planes_go_with_the_body():
@@ -115,7 +120,7 @@ def test_planes_go_with_the_body():
     turn = (turn * np.sign(np.linalg.det(turn))).astype(np.float32)
     shift = np.array([0.3, -0.2, 0.5], np.float32)
     patches = proximity.patches(vertices, faces)
-    found = contact.find(positions, vertices, vertices @ turn.T + shift, patches)
+    found = contact_search.find(positions, vertices, vertices @ turn.T + shift, patches)
     np.testing.assert_allclose(found.point_next, np.asarray(found.point) @ turn.T + shift, atol=2e-6)
     np.testing.assert_allclose(found.normal_next, np.asarray(found.normal) @ turn.T, atol=2e-5)
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, atol=1e-5)
@@ -126,10 +131,10 @@ def test_on_a_face_an_edge_or_a_corner_the_plane_faces_outwards():
     vertices = vertices.astype(np.float32)
     corners = vertices[faces]
     positions = np.concatenate([corners.mean(1), 0.5 * (corners[:, 0] + corners[:, 1]), corners[:, 2]])
-    found = contact.find(positions, vertices, vertices, proximity.patches(vertices, faces))
+    found = contact_search.find(positions, vertices, vertices, proximity.patches(vertices, faces))
     outwards = positions / np.linalg.norm(positions, axis=1, keepdims=True)
     assert (np.sum(np.asarray(found.normal) * outwards, axis=1) > 0.9).all()
-    np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), 0.0, atol=1e-6)
+    np.testing.assert_allclose(contact_search.distance(positions, found.point, found.normal), 0.0, atol=1e-6)
 
 
 def test_gradients_are_finite_on_the_surface_and_on_triangles_without_area():
@@ -141,8 +146,8 @@ def test_gradients_are_finite_on_the_surface_and_on_triangles_without_area():
     positions = np.concatenate([vertices, vertices[faces].mean(1), flattened[faces[:1, 0]] * 1.001])
 
     def total(positions, body):
-        found = contact.find(positions, body, body, patches)
-        return jnp.sum(contact.distance(positions, found.point_next, found.normal_next) ** 2)
+        found = contact_search.find(positions, body, body, patches)
+        return jnp.sum(contact_search.distance(positions, found.point_next, found.normal_next) ** 2)
 
     for surface in (vertices, flattened):
         gradients = jax.grad(total, argnums=(0, 1))(positions, surface)
@@ -151,16 +156,16 @@ def test_gradients_are_finite_on_the_surface_and_on_triangles_without_area():
 
 def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     config = Config()
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     scene = whole.scene
-    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "run_3")))
-    poses = clips.poses(reel, jnp.int32(40))
+    character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "run_3")))
+    poses = motion_clips.poses(reel, jnp.int32(40))
     window = characters.window(scene, character, poses)
-    state = rollout.start(character, window, 0)
+    state = time_step.start(character, window, 0)
     shaken = state.position + 0.01 * jax.random.normal(jax.random.key(0), state.position.shape)
-    planes = rollout.time_step(scene, character, state._replace(position=shaken), window, 1 / 30, config).contact
-    distance = contact.distance(shaken, planes.point, planes.normal)
+    planes = time_step.time_step(scene, character, state._replace(position=shaken), window, 1 / 30, config).contact
+    distance = contact_search.distance(shaken, planes.point, planes.normal)
     body = skinning.pose_body(
         whole.body, whole.body.vertices, whole.body.joints, Pose(poses.rotations[1], poses.translation[1])
     )
@@ -171,8 +176,10 @@ def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     np.testing.assert_allclose(distance, expected, atol=1e-5)
     assert (expected < -1e-3).sum() > 20
     # the same triangles at the next frame
-    advanced = contact.find(planes.point_next, *2 * (window.following.body,), scene.patches)
-    np.testing.assert_allclose(contact.distance(planes.point_next, advanced.point, advanced.normal), 0.0, atol=1e-5)
+    advanced = contact_search.find(planes.point_next, *2 * (window.following.body,), scene.patches)
+    np.testing.assert_allclose(
+        contact_search.distance(planes.point_next, advanced.point, advanced.normal), 0.0, atol=1e-5
+    )
 
 
 STOOPING = {"LeftUpLeg": [-50, 6, 7], "RightUpLeg": [-50, -6, -7], "LowerBack": [30, 0, 0]}
@@ -187,9 +194,9 @@ def bent(turns, betas):
         betas: as {number: value}.
     """
     config = Config(garment="skirt_1000")
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     betas = jnp.array([betas.get(i, 0.0) for i in range(10)])
-    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
+    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
     rotations = np.tile(np.eye(3, dtype=np.float32), (len(whole.names), 1, 1))
     for joint, degrees in turns.items():
         rotations[whole.names.index(joint)] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
@@ -223,10 +230,10 @@ def test_nothing_is_inside_in_front_of_skin_that_is_folded_inside_out(turns, bet
         np.asarray(positions, np.float64), np.asarray(body, np.float64), np.asarray(scene.body.faces, np.int64),
         sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
     )[0]  # fmt: skip
-    state = rollout.start(character, window, 0)._replace(position=positions, velocity=jnp.zeros_like(positions))
-    found = rollout.time_step(scene, character, state, window, jnp.float32(1 / 30), config).contact
+    state = time_step.start(character, window, 0)._replace(position=positions, velocity=jnp.zeros_like(positions))
+    found = time_step.time_step(scene, character, state, window, jnp.float32(1 / 30), config).contact
     wrong, right = energies(pseudonormals)
-    still_wrong, still_right = energies(contact.distance(positions, found.point, found.normal))
+    still_wrong, still_right = energies(contact_search.distance(positions, found.point, found.normal))
     assert wrong > 10.0  # J; else nothing is folded here
     assert still_wrong <= 0.01 * wrong
     assert still_right >= 0.95 * right
@@ -242,11 +249,11 @@ def test_nothing_is_inside_in_front_of_skin_that_was_pushed_through():
     x, y = np.random.default_rng(0).uniform(-0.04, 0.04, (2, 50))
     for height, expected in ((0.08, 0.03), (0.07, 0.02)):
         positions = np.stack([x, y, np.full(50, height)], axis=1).astype(np.float32)
-        found = contact.find(positions, vertices, vertices, patches)
-        np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), expected, atol=1e-5)
+        found = contact_search.find(positions, vertices, vertices, patches)
+        np.testing.assert_allclose(contact_search.distance(positions, found.point, found.normal), expected, atol=1e-5)
     positions = np.stack([x / 2 + 0.18, 2 * y, np.zeros(50)], axis=1).astype(np.float32)  # where it still is a slab
-    found = contact.find(positions, vertices, vertices, patches)
-    assert (contact.distance(positions, found.point, found.normal) < 0).all()
+    found = contact_search.find(positions, vertices, vertices, patches)
+    assert (contact_search.distance(positions, found.point, found.normal) < 0).all()
 
 
 @pytest.mark.parametrize("height, speed", [(0.058, 0.0), (0.058, 0.05), (0.04, 0.0), (0.056, 0.12)])
@@ -259,10 +266,10 @@ def test_a_foot_that_passes_by_does_not_take_cloth_along(height, speed):
     positions = np.float32([[0.13, height, -0.02], [0.13, height, 0.02], [0.13, height, 0.03]])
     ahead = positions + np.float32([speed, 0.0, 0.0])
     moved = vertices + step
-    planes = contact.find(positions, vertices, moved, patches)
-    kept = contact.find(positions, vertices, moved, patches, ahead)
-    late, gap = (np.asarray(contact.distance(ahead, x.point_next, x.normal_next)) for x in (planes, kept))
-    edges = contact.find_at_edges(positions, kept, mesh, vertices, moved, patches, ahead)
+    planes = contact_search.find(positions, vertices, moved, patches)
+    kept = contact_search.find(positions, vertices, moved, patches, ahead)
+    late, gap = (np.asarray(contact_search.distance(ahead, x.point_next, x.normal_next)) for x in (planes, kept))
+    edges = contact_search.find_at_edges(positions, kept, mesh, vertices, moved, patches, ahead)
     at_edges = np.sum((ahead[:1] - edges.point_next) * edges.normal_next, axis=1)
     hit, along = height < 0.05, speed == 0.12
     if hit or along:  # it is in the way, or goes with the foot
@@ -270,7 +277,7 @@ def test_a_foot_that_passes_by_does_not_take_cloth_along(height, speed):
         assert (gap < -0.05).all() if hit else (gap > 0).all()
     else:
         assert (late < -0.02).all()
-        np.testing.assert_allclose(gap, contact.distance(positions, kept.point, kept.normal), atol=1e-6)
+        np.testing.assert_allclose(gap, contact_search.distance(positions, kept.point, kept.normal), atol=1e-6)
         assert (gap > 0).all() and (at_edges > 0).all()
     np.testing.assert_array_equal(kept.normal_next, planes.normal_next)
 
@@ -282,27 +289,27 @@ def test_a_plane_that_stays_behind_lets_go_of_what_was_inside():
     positions = np.float32([[0.1245, 0.0485, 0.0]])
     ahead = positions + np.float32([0.0, 0.025, 0.0])
     moved = vertices + np.float32([0.12, 0.0, 0.0])
-    found = contact.find(positions, vertices, moved, proximity.patches(vertices, foot.faces), ahead)
-    np.testing.assert_allclose(contact.distance(positions, found.point, found.normal), -5e-4, atol=1e-6)
-    np.testing.assert_allclose(contact.distance(ahead, found.point_next, found.normal_next), 0.0, atol=1e-6)
+    found = contact_search.find(positions, vertices, moved, proximity.patches(vertices, foot.faces), ahead)
+    np.testing.assert_allclose(contact_search.distance(positions, found.point, found.normal), -5e-4, atol=1e-6)
+    np.testing.assert_allclose(contact_search.distance(ahead, found.point_next, found.normal_next), 0.0, atol=1e-6)
 
 
 def test_a_time_step_leaves_planes_behind():
     """A t-shirt that rests while its wearer leaps forwards by 12 cm: what the body is then not around is let go."""
     config = Config(garment="tshirt_1000")
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     scene, mesh = whole.scene, whole.scene.mesh
-    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "walk_0")))
-    poses = clips.poses(reel, jnp.int32(40))
+    character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "walk_0")))
+    poses = motion_clips.poses(reel, jnp.int32(40))
     leap = poses._replace(translation=jnp.zeros((3, 3)).at[2, 2].set(0.12))
     window = characters.window(scene, character, leap)
-    state = rollout.start(character, window, 0)
+    state = time_step.start(character, window, 0)
     state = state._replace(velocity=jnp.zeros_like(state.velocity))
-    step = rollout.time_step(scene, character, state, window, jnp.float32(1 / 30), config)
+    step = time_step.time_step(scene, character, state, window, jnp.float32(1 / 30), config)
     body, body_next, x = window.current.body, window.following.body, state.position
-    planes = contact.find(x, body, body_next, scene.patches)
-    at_edges = contact.find_at_edges(x, planes, mesh, body, body_next, scene.patches)
+    planes = contact_search.find(x, body, body_next, scene.patches)
+    at_edges = contact_search.find_at_edges(x, planes, mesh, body, body_next, scene.patches)
     vertices = skinning.pose_body(
         whole.body, whole.body.vertices, whole.body.joints, Pose(leap.rotations[2], leap.translation[2])
     )
@@ -311,7 +318,7 @@ def test_a_time_step_leaves_planes_behind():
     for name, where in (("collision", x), ("edge_collision", places)):
         outside = winding(whole, np.asarray(vertices, np.float64), where) < 0.5
         energies = [
-            np.asarray(losses.elements(x, some, mesh, config.physics)[name])
+            np.asarray(incremental_potential.elements(x, some, mesh, config.physics)[name])
             for some in (step._replace(contact=planes, edge_contact=at_edges), step)
         ]
         wrong, still_wrong = (e[outside].sum() for e in energies)
@@ -338,13 +345,15 @@ def test_a_thin_limb_is_felt_between_two_vertices(height, aside):
     vertices, faces = limb()
     across = np.array([[-0.03 + aside, height, 0.013], [0.03 + aside, height, 0.013], [0.0, 1.0, 0.0]], np.float32)
     mesh, patches = topology.mesh(np.array([[0, 1, 2]])), proximity.patches(vertices, faces)
-    planes = contact.find(across, vertices, vertices, patches)
-    assert (contact.distance(across, planes.point, planes.normal)[:2] > 4.9e-3).all()
-    found = contact.find_at_edges(across, planes, mesh, vertices, vertices, patches)
+    planes = contact_search.find(across, vertices, vertices, patches)
+    assert (contact_search.distance(across, planes.point, planes.normal)[:2] > 4.9e-3).all()
+    found = contact_search.find_at_edges(across, planes, mesh, vertices, vertices, patches)
     edge = [tuple(e) for e in mesh.edges.tolist()].index((0, 1))
     place = across[0] + float(found.place[edge]) * (across[1] - across[0])
     assert abs(place[0]) <= 0.01  # above the bar
-    distance = contact.distance(place[None], found.point_next[edge : edge + 1], found.normal_next[edge : edge + 1])
+    distance = contact_search.distance(
+        place[None], found.point_next[edge : edge + 1], found.normal_next[edge : edge + 1]
+    )
     np.testing.assert_allclose(distance, height - 0.02, atol=1e-6)
 
 
@@ -359,10 +368,12 @@ def test_an_edge_across_the_edge_of_a_body_touches_where_the_two_cross():
     for _ in range(50):
         lean, height, half = random.uniform(-0.3, 0.3), random.uniform(-0.005, 0.01), 0.03
         ends = np.array([[-half, height, -half * lean], [half, height, half * lean], [0, 1, 0]], np.float32)
-        planes = contact.find(ends, ridge, ridge, patches)
-        found = contact.find_at_edges(ends, planes, mesh, ridge, ridge, patches)
+        planes = contact_search.find(ends, ridge, ridge, patches)
+        found = contact_search.find_at_edges(ends, planes, mesh, ridge, ridge, patches)
         place = ends[0] + float(found.place[edge]) * (ends[1] - ends[0])
-        distance = contact.distance(place[None], found.point_next[edge : edge + 1], found.normal_next[edge : edge + 1])
+        distance = contact_search.distance(
+            place[None], found.point_next[edge : edge + 1], found.normal_next[edge : edge + 1]
+        )
         # crossing lines at right angles to the vertical: above by the height, below by its way out through a side
         np.testing.assert_allclose(distance, height if height > 0 else height / np.sqrt(2), atol=1e-5)
 
@@ -372,8 +383,8 @@ def test_a_flat_body_touches_an_edge_in_its_middle_also_where_they_are_parallel(
     for ends in ([[-0.05, 0.022, 0.0], [0.05, 0.022, 0.0]], [[0.0, 0.02, -0.05], [0.0, 0.02, 0.05]]):
         positions = np.array([*ends, [0, 1, 0]], np.float32)
         patches, mesh = proximity.patches(vertices, faces), topology.mesh(np.array([[0, 1, 2]]))
-        planes = contact.find(positions, vertices, vertices, patches)
-        found = contact.find_at_edges(positions, planes, mesh, vertices, vertices, patches)
+        planes = contact_search.find(positions, vertices, vertices, patches)
+        found = contact_search.find_at_edges(positions, planes, mesh, vertices, vertices, patches)
         edge = [tuple(e) for e in mesh.edges.tolist()].index((0, 1))
         # 1e-8 m of rounding tilt a normal over 2 mm, which 10 cm of length make 1e-6 m of the 1e-4 m that are level
         np.testing.assert_allclose(found.place[edge], 0.5, atol=0.05)
@@ -384,23 +395,23 @@ def test_a_flat_body_touches_an_edge_in_its_middle_also_where_they_are_parallel(
 def test_edges_of_a_garment_touch_what_is_nearest_to_them():
     """Sought near the ends' contact, found as if the whole body had been gone through: where cloth is near a body."""
     config = Config(garment="tshirt_1000")
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     scene, mesh = whole.scene, whole.scene.mesh
-    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "run_3")))
+    character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "run_3")))
     near = lost = 0
     for frame in (20, 40, 60):
-        window = characters.window(scene, character, clips.poses(reel, jnp.int32(frame)))
+        window = characters.window(scene, character, motion_clips.poses(reel, jnp.int32(frame)))
         body = window.current.body
         positions = characters.skinned(character, window.current)
         positions += 3e-3 * jax.random.normal(jax.random.key(frame), positions.shape)
-        planes = contact.find(positions, body, body, scene.patches)
-        found = contact.find_at_edges(positions, planes, mesh, body, body, scene.patches)
+        planes = contact_search.find(positions, body, body, scene.patches)
+        found = contact_search.find_at_edges(positions, planes, mesh, body, body, scene.patches)
         start, end = positions[mesh.edges[:, 0]], positions[mesh.edges[:, 1]]
         between = start + found.place[:, None] * (end - start)
-        distance = contact.distance(between, found.point_next, found.normal_next)
-        expected = contact.find(between, body, body, scene.patches)
-        expected = contact.distance(between, expected.point, expected.normal)
+        distance = contact_search.distance(between, found.point_next, found.normal_next)
+        expected = contact_search.find(between, body, body, scene.patches)
+        expected = contact_search.distance(between, expected.point, expected.normal)
         touching = np.abs(expected) < 0.02
         near += touching.sum()
         lost += (touching & (np.abs(distance - expected) > 1e-4)).sum()
@@ -417,8 +428,8 @@ def test_an_edge_without_length_and_a_body_without_area_give_finite_contact():
         patches = proximity.patches(vertices, faces)
 
         def total(positions, body=body, patches=patches):
-            planes = contact.find(positions, body, body, patches)
-            found = contact.find_at_edges(positions, planes, mesh, body, body, patches)
+            planes = contact_search.find(positions, body, body, patches)
+            found = contact_search.find_at_edges(positions, planes, mesh, body, body, patches)
             return sum(jnp.sum(x) for x in jax.tree.leaves(found))
 
         value, gradient = jax.value_and_grad(total)(jnp.asarray(positions))
@@ -436,7 +447,7 @@ def test_a_garment_touches_itself_at_its_nearest_other_triangle():
     shift = np.array([[0.01, 4e-3, 0.015]])
     positions = np.concatenate([low, low + shift]).astype(np.float32)
     faces = np.concatenate([one, one + 49])
-    found = contact.find_on_self(positions, proximity.patches(positions, faces))
+    found = contact_search.find_on_self(positions, proximity.patches(positions, faces))
     assert not (found.corners == np.arange(98)[:, None]).any()
     place = np.einsum("vk,vkc->vc", found.weights, positions[found.corners])
     inner = np.r_[8:13, 15:20, 22:27]  # vertices of the lower sheet that have the upper one above them

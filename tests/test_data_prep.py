@@ -11,7 +11,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from clothjax import plausibility, skinning, storage
+from clothjax.body import plausibility, skinning
+from clothjax.files import storage
 from clothjax.types import Body
 from data_prep import anny, asf_amc, bvh, garment, mesh, procedural, retarget
 from data_prep.diffusion import diffuse

@@ -14,10 +14,18 @@ import numpy as np
 import pytest
 
 import clothjax as cj
-from clothjax import features, metrics, motion_matching, rollout, skinning, storage, trained
+from clothjax import material
+from clothjax.body import motion_matching, skinning
 from clothjax.config import MaterialConfig
+from clothjax.evaluation import metrics
+from clothjax.files import storage
+from clothjax.networks import animators
+from clothjax.runtime import trained
+from clothjax.simulation import rollout
 from clothjax.types import Material, Pose
-from experiments import demo, live
+from experiments.demo import live
+from experiments.demo import viewer as viewer_module
+from experiments.demo.viewer import DEEP, start
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
@@ -94,7 +102,12 @@ def test_phi_frame_by_frame_is_phi_all_at_once(clips):
     )
     windows = Pose(jnp.asarray(rotations), jnp.asarray(translation - here[:, None]))
     _, model = trained.phi(SKIRT)
-    play = jax.jit(lambda m, p: rollout.play(m, comparison.scene, character, p, comparison.config)[0])
+
+    @jax.jit
+    def play(model, poses):
+        animator = animators.phi_animator(model, comparison.scene, character, comparison.config)
+        return rollout.play(animator, comparison.scene, character, poses, comparison.config).position
+
     expected = np.asarray(play(jax.tree.map(jnp.asarray, model), windows)) + here[:, None]
     apart = np.linalg.norm(np.stack(found) - expected, axis=-1)
     assert apart[0].max() < 2e-4 and apart.mean() < 1.5e-3  # rounding grows from frame to frame
@@ -141,9 +154,9 @@ def test_random_steering_leaves_nothing_infinite(clips, frames):
 def test_a_slider_is_a_share_of_the_training_range(name):
     between = getattr(MaterialConfig(), f"{name}_range")
     for share, value in ((0.0, between.low), (1.0, between.high)):
-        assert features.unscaled(share, between) == pytest.approx(value)
-    assert features.scaled(features.unscaled(0.3, between), between) == pytest.approx(0.3, rel=1e-5)
-    assert features.unscaled(0.5, MaterialConfig().mu_range) == pytest.approx(np.sqrt(15909.0 * 63636.0))
+        assert material.unscaled(share, between) == pytest.approx(value)
+    assert material.scaled(material.unscaled(0.3, between), between) == pytest.approx(0.3, rel=1e-5)
+    assert material.unscaled(0.5, MaterialConfig().mu_range) == pytest.approx(np.sqrt(15909.0 * 63636.0))
 
 
 def test_strain_is_that_of_the_edges():
@@ -160,18 +173,18 @@ def test_clips_of_yours_are_called_as_their_files(tmp_path):
     paths = [tmp_path / name for name in ("a.walk_1.motion.h5", "b.walk.h5")]
     for path in paths:
         storage.save_motion(path, clip, names, name="walk", source="here", licence="CC0")
-    assert set(demo.clips(paths, names)) == {"a.walk_1", "b.walk"}
+    assert set(viewer_module.clips(paths, names)) == {"a.walk_1", "b.walk"}
     (tmp_path / "more").mkdir()
     shutil.copy(paths[1], tmp_path / "more" / "b.walk.motion.h5")
     with pytest.raises(ValueError, match=r"b\.walk\.motion\.h5: another clip is called b\.walk too"):
-        demo.clips([*paths, tmp_path / "more" / "b.walk.motion.h5"], names)
+        viewer_module.clips([*paths, tmp_path / "more" / "b.walk.motion.h5"], names)
 
 
 @pytest.fixture
 def viewer():
     pytest.importorskip("viser")
     given = argparse.Namespace(garment="skirt", run=None, motions=None, host="127.0.0.1", port=8123, no_browser=True)
-    viewer = demo.start(given)
+    viewer = start(given)
     yield viewer
     viewer.server.stop()
 
@@ -200,8 +213,8 @@ def test_what_is_inside_the_body_is_red(viewer):
     for stage, body in zip(("psi", "skinning"), viewer._shown[1], strict=True):
         depth, _ = metrics.penetration(viewer._shown[0][stage][0], body, viewer.show.body_faces)
         red, _, blue = viewer.meshes[f"/{stage}/penetration"].colors.T.astype(int)
-        clear = np.abs(depth / demo.DEEP - 0.5) > 0.01  # colours are rounded
-        np.testing.assert_array_equal((red > blue)[clear], (depth > 0.5 * demo.DEEP)[clear])
+        clear = np.abs(depth / DEEP - 0.5) > 0.01  # colours are rounded
+        np.testing.assert_array_equal((red > blue)[clear], (depth > 0.5 * DEEP)[clear])
         inside[stage] = (depth > 0).mean()
     assert inside["psi"] < inside["skinning"]
 

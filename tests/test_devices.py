@@ -16,9 +16,10 @@ import pytest
 import yaml
 from toy import assert_same, small
 
-from clothjax import checkpoint, configuration, devices
 from clothjax.config import TuningConfig
-from clothjax.trained import STAGES
+from clothjax.files import checkpoint, configuration
+from clothjax.runtime.trained import STAGES
+from clothjax.training import devices
 from experiments import train
 
 ROOT = Path(__file__).parents[1]

@@ -4,7 +4,8 @@ import subprocess
 import sys
 from importlib import metadata
 
-from clothjax import doctor, trained
+from clothjax import doctor
+from clothjax.runtime import trained
 
 
 def test_a_whole_installation():

@@ -16,7 +16,7 @@ from test_data_prep import AMC, ASF, BVH
 from test_fuzz import _smpl
 from test_smpl import recording
 
-from clothjax import storage
+from clothjax.files import storage
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = ("README.md", "experiments/README.md")
@@ -115,10 +115,11 @@ def test_commands(workplace):
 @pytest.mark.slow
 def test_the_reference_is_made_from_the_docstrings(tmp_path):
     run(["make", "docs", f"API={tmp_path}", f"VENV={sys.prefix}"], ROOT)
-    page = (tmp_path / "clothjax" / "inference.html").read_text()
+    page = (tmp_path / "clothjax" / "runtime" / "inference.html").read_text()
     assert "the garment's vertices [V, 3] m in the world" in page
-    made = {path.stem for path in (tmp_path / "clothjax").glob("*.html")}
-    assert {path.stem for path in (ROOT / "clothjax").glob("[a-z]*.py")} <= made
+    made = {path.relative_to(tmp_path).with_suffix("") for path in (tmp_path / "clothjax").rglob("*.html")}
+    modules = (ROOT / "clothjax").rglob("[a-z]*.py")
+    assert {path.relative_to(ROOT).with_suffix("") for path in modules} <= made
 
 
 def run(command: list[str], folder: Path) -> None:

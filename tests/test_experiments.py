@@ -7,11 +7,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clothjax import checkpoint, clips, experiment, features, inference, metrics, scene, trained
+from clothjax.body import motion_clips
 from clothjax.config import Config
+from clothjax.evaluation import metrics, pictures, rollouts
+from clothjax.evaluation import report as measures
+from clothjax.files import checkpoint
+from clothjax.networks import normalisation
+from clothjax.runtime import inference, trained
+from clothjax.simulation import assembly, scene
+from clothjax.training import pipeline
 from clothjax.types import Motion
-from experiments import evaluate, gallery, quickstart, render, stability, train, tune
-from experiments.stress import closed_loop
+from experiments import evaluate, gallery, quickstart, render, tune
+from experiments.stability import closed_loop
+from experiments.stability.report import main, solver
 
 TOY = [
     "--stage1.steps", "60", "--stage1.pool", "4", "--stage2.steps", "40", "--stage2.sequences", "4",
@@ -64,8 +72,8 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
 
 def test_a_finished_run_is_not_trained_again(finished):
     before = sorted(path.name for path in (finished / "stage1" / "checkpoints").iterdir())
-    config = train.load_phi(finished)[0].config
-    train.train(config, finished)
+    config = rollouts.load_run(finished)[0].config
+    pipeline.train(config, finished)
     assert sorted(path.name for path in (finished / "stage1" / "checkpoints").iterdir()) == before
 
 
@@ -82,7 +90,7 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch
     monkeypatch.setattr(gallery, "BODIES", ("heavy",))
     gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(picture)])
     width, height = Image.open(picture).size
-    assert width > gallery.SIZE[0] and height > 3 * gallery.SIZE[1]  # a body; three methods
+    assert width > pictures.GALLERY_SIZE[0] and height > 3 * pictures.GALLERY_SIZE[1]  # a body; three methods
     with pytest.raises(ValueError, match=r"twist_3 has frames 1 to \d+ to show, not 1000"):
         gallery.main([str(finished), "--motions", "twist_3", "--frame", "1000", "--out", str(picture)])
 
@@ -99,9 +107,9 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
         checkpoint.named(model).items(), checkpoint.named(model_packed).values(), strict=True
     ):
         assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
-    whole = experiment.assemble(config)
-    clip = experiment.motion(whole, "walk_3")
-    one, other = (evaluate.psi_trajectory(inference.load(which), clip)[:20] for which in (finished, "toy"))
+    whole = assembly.assemble(config)
+    clip = assembly.motion(whole, "walk_3")
+    one, other = (rollouts.psi_trajectory(inference.load(which), clip)[:20] for which in (finished, "toy"))
     assert 0 < metrics.distance_mm(one, other).max() < 1.0
     with pytest.raises(ValueError, match="no garment called 'coat' comes with clothjax; there are: toy"):
         render.main(["--pretrained", "coat", "--out", "x.png"])
@@ -123,7 +131,7 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
     shutil.copytree(finished / "tuning", run / "tuning")
     shutil.rmtree(run / "stage2")
     with pytest.raises(ValueError, match="tuning belongs to a stage 2 that is no longer there"):
-        train.train(trained.phi(run)[0], run)
+        pipeline.train(trained.phi(run)[0], run)
 
 
 def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
@@ -145,8 +153,8 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     assert max(np.abs(a - b).max() for a, b in zip(jax.tree.leaves(one[2]), jax.tree.leaves(other[2]))) > 1e-3
     assert (other[3].pose.low <= one[3].pose.low).all() and (other[3].pose.high >= one[3].pose.high).all()
     assert (other[3].pose.low < one[3].pose.low).any() and (other[3].pose.high > one[3].pose.high).any()
-    clip = experiment.motion(experiment.assemble(config), "dance_3")
-    assert np.isfinite(evaluate.psi_trajectory(inference.load(tmp_path / "out"), clip)).all()
+    clip = assembly.motion(assembly.assemble(config), "dance_3")
+    assert np.isfinite(rollouts.psi_trajectory(inference.load(tmp_path / "out"), clip)).all()
     with pytest.raises(ValueError, match="no garment called 'coat'"):
         tune.main(["coat", "--out", str(tmp_path / "out")])
     with pytest.raises(ValueError, match=r"tuning\.steps is 0"):
@@ -155,9 +163,9 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solvers(finished):
-    config = train.load_phi(finished)[0].config
+    config = rollouts.load_run(finished)[0].config
     settings = dataclasses.replace(config.evaluation, frames=14, solver_frames=20, betas=0.25)
-    report = evaluate.evaluate(finished, ["twist_3"], settings)
+    report = measures.evaluate(finished, ["twist_3"], settings)
     assert report["motions"]["twist_3"]["solver"]["frames"] == 12 and np.abs(report["betas"]).max() <= 0.25
 
 
@@ -171,15 +179,15 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
         stage = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
         return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), stage), "motions": {}}
 
-    monkeypatch.setattr(evaluate, "evaluate", measured)
-    report = evaluate.pretrained({name: tmp_path / name for name in figures})
+    monkeypatch.setattr(measures, "evaluate", measured)
+    report = measures.evaluate_packed({name: tmp_path / name for name in figures})
     assert report["mean"]["psi"] == {"energy_gap": 0.2, "penetration_max_mm": 2.0, "finite": False}
     assert report["dress"]["phi"]["energy_gap"] == 0.3 and report["skirt"]["motions"] == {}
 
 
 def test_wearers_are_thin_and_heavy_soft_and_stiff():
-    whole = experiment.assemble(Config())
-    wearers = experiment.wearers(whole)
+    whole = assembly.assemble(Config())
+    wearers = assembly.wearers(whole)
     assert len(wearers) == 9
 
     def size(betas):
@@ -201,7 +209,7 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
 def test_a_clip_there_and_back_has_no_jump():
     rotations = np.tile(np.eye(3), (5, 2, 1, 1))
     clip = Motion(rotations, np.arange(15.0).reshape(5, 3), 30.0)
-    long = experiment.there_and_back(clip, 13)
+    long = assembly.there_and_back(clip, 13)
     assert long.translation[:, 0].tolist() == [0, 3, 6, 9, 12, 9, 6, 3, 0, 3, 6, 9, 12]
 
 
@@ -209,15 +217,15 @@ def test_every_family_is_started_from_equally_often_and_never_near_a_bad_frame()
     def clip(frames):
         return Motion(np.tile(np.eye(3), (frames, 1, 1, 1)), np.zeros((frames, 3)), 30.0)
 
-    reel = clips.concatenate([clip(100), clip(20)], ["walk", "jump"], [np.array([50]), np.zeros(0, int)], 3)
-    drawn = np.asarray(jax.vmap(lambda u: clips.draw(reel, u))(np.linspace(0, 0.9999, 4000, dtype=np.float32)))
+    reel = motion_clips.concatenate([clip(100), clip(20)], ["walk", "jump"], [np.array([50]), np.zeros(0, int)], 3)
+    drawn = np.asarray(jax.vmap(lambda u: motion_clips.draw(reel, u))(np.linspace(0, 0.9999, 4000, dtype=np.float32)))
     assert abs((drawn < 100).mean() - 0.5) < 0.01
     assert (reel.remaining[drawn] >= 3).all()
     # three steps from 46 read poses 45 to 49, from 47 also the bad frame
     assert 46 in drawn and 52 in drawn
     assert not np.isin(drawn, [47, 48, 49, 50, 51]).any()
     with pytest.raises(ValueError, match="no motion has 102 usable frames"):
-        clips.concatenate([clip(100)], ["walk"], [np.zeros(0, int)], 100)
+        motion_clips.concatenate([clip(100)], ["walk"], [np.zeros(0, int)], 100)
 
 
 def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
@@ -226,8 +234,8 @@ def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
         rotations[:, 0, 0, 0] = first + np.arange(frames)  # numbers them
         return Motion(rotations, np.arange(frames)[:, None] ** 2 * [1.0, 0.0, 0.0], 30.0)
 
-    reel = clips.concatenate([clip(9, 0), clip(6, 100)], ["", ""], [np.array([8]), np.zeros(0, int)], 1)
-    poses = clips.there_and_back(jax.tree.map(jax.numpy.asarray, reel), 5, 14)
+    reel = motion_clips.concatenate([clip(9, 0), clip(6, 100)], ["", ""], [np.array([8]), np.zeros(0, int)], 1)
+    poses = motion_clips.there_and_back(jax.tree.map(jax.numpy.asarray, reel), 5, 14)
     seen = np.asarray(poses.rotations[..., 0, 0, 0])
     assert seen[:, 1].tolist() == [5, 6, 7, 6, 5, 4, 3, 2, 1, 0, 1, 2, 3, 4]
     np.testing.assert_array_equal(seen[1:, 0], seen[:-1, 1])
@@ -237,13 +245,13 @@ def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
 
 def test_frame_rates_must_agree(tmp_path):
     config = Config(fps=60.0)
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     with pytest.raises(ValueError, match=r"walk_0 has 30\.0 frames a second, the experiment 60\.0"):
-        experiment.motion(whole, "walk_0")
+        assembly.motion(whole, "walk_0")
 
 
 def test_the_body_in_reach_reaches_beyond_the_garment_without_head_or_hands():
-    whole = experiment.assemble(Config())
+    whole = assembly.assemble(Config())
     dominant = {whole.names[j] for j in np.asarray(whole.scene.body.weights).argmax(1)}
     assert {"Hips", "Spine", "LeftArm", "RightForeArm", "LeftUpLeg"} <= dominant
     assert not {"Head", "LeftHand", "RightHandFinger1", "LeftFoot"} & dominant
@@ -252,7 +260,7 @@ def test_the_body_in_reach_reaches_beyond_the_garment_without_head_or_hands():
 
 
 def test_a_garment_elsewhere_is_refused():
-    whole = experiment.assemble(Config())
+    whole = assembly.assemble(Config())
     far = whole.garment._replace(vertices=whole.garment.vertices + 5)
     with pytest.raises(ValueError, match="no part of the body is within"):
         scene.reachable(whole.body, far, 0.35)
@@ -263,9 +271,9 @@ def test_statistics_are_those_of_all_rows_counted():
     batches = [random.normal(3.0, 2.0, (10 * i + 10, 4)).astype(np.float32) + i for i in range(5)]
     counted = [random.random(len(batch)) < 0.5 for batch in batches]
     counted[2][:] = False  # nothing to see
-    every = some = features.empty_statistics(4)
+    every = some = normalisation.empty_statistics(4)
     for batch, which in zip(batches, counted):
-        every, some = features.observe(every, batch), features.observe(some, batch, which)
+        every, some = normalisation.observe(every, batch), normalisation.observe(some, batch, which)
     for statistics, rows in (
         (every, np.concatenate(batches)),
         (some, np.concatenate([batch[which] for batch, which in zip(batches, counted)])),
@@ -278,9 +286,9 @@ def test_statistics_are_those_of_all_rows_counted():
 @pytest.mark.slow
 def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
     """Its two-minute version, with the closed loops of a run that was hardly trained: they need not be good."""
-    monkeypatch.setattr(stability.solver, "stress", lambda *_: {})  # has tests of its own
+    monkeypatch.setattr(solver, "stress", lambda *_: {})  # has tests of its own
     monkeypatch.setattr(closed_loop, "AFTER", 20)
-    stability.main([str(finished), "--quick", "--json", str(tmp_path / "s.json")])
+    main([str(finished), "--quick", "--json", str(tmp_path / "s.json")])
     report = json.loads((tmp_path / "s.json").read_text())
     assert report["physics"]["configurations"] == 9000 and report["physics"]["nonfinite"] == 0
     assert report["float32"]["energy_error"] <= 1e-5 and report["float32"]["gradient_error"] <= 1e-4

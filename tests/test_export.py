@@ -14,9 +14,11 @@ import pytest
 from toy import small
 
 import clothjax as cj
-from clothjax import folding, inference, skinning, storage
+from clothjax.body import skinning
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
+from clothjax.files import storage
+from clothjax.runtime import inference, specialise
 from clothjax.types import Motion, Pose
 from experiments import convert
 
@@ -39,7 +41,7 @@ def apart(found, model, motion):
 def test_onnx_is_the_model_in_closed_loop(model, motion, tmp_path):
     path = onnx.to_onnx(model, tmp_path / "g.onnx")
     assert apart(onnx.run_onnx(path, model, motion), model, motion).max() < 2e-5
-    small_model = folding.specialise(model, blendshapes=100)
+    small_model = specialise.specialise(model, blendshapes=100)
     path = onnx.to_onnx(small_model, tmp_path / "s.onnx")
     found = onnx.run_onnx(path, small_model, motion)
     assert apart(found, small_model, motion).max() < 2e-5 and apart(found, model, motion).max() > 1e-3
@@ -49,8 +51,8 @@ def test_onnx_of_a_folded_code_and_of_a_relu(motion, tmp_path):
     from test_folding import wide
 
     model = wide.__wrapped__()
-    for name, each in (("plain", model), ("folded", folding.specialise(model)),
-                       ("fewer", folding.specialise(model, blendshapes=5))):  # fmt: skip
+    for name, each in (("plain", model), ("folded", specialise.specialise(model)),
+                       ("fewer", specialise.specialise(model, blendshapes=5))):  # fmt: skip
         path = onnx.to_onnx(each, tmp_path / f"{name}.onnx")
         assert apart(onnx.run_onnx(path, each, motion), each, motion).max() < 1e-5
     assert model.config.model.blendshape_relu and small().model.decoder_skip
@@ -127,7 +129,7 @@ def test_an_engine_can_skin_the_garment_and_need_not_see_it(model, motion, tmp_p
     pose = Pose(np.asarray(motion.rotations[5], np.float32), motion.translation[5])
     feed = dict(zip(onnx.INPUTS, (*onnx.first_state(model, pose), pose.rotations[None], pose.translation[None])))
     shown = session(onnx.to_onnx(model, tmp_path / "w.onnx")).run(None, feed)
-    canonical = onnx.to_onnx(folding.specialise(model), tmp_path / "c.onnx", output="canonical")
+    canonical = onnx.to_onnx(specialise.specialise(model), tmp_path / "c.onnx", output="canonical")
     *state, vertices = session(canonical).run(None, feed)
     told = json.loads(canonical.with_suffix(".json").read_text())
     transforms = skinning.joint_transforms(
@@ -266,7 +268,7 @@ def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
 
 
 def test_safetensors_hold_the_whole_model(model, motion, tmp_path):
-    for each in (model, folding.specialise(model, blendshapes=50)):
+    for each in (model, specialise.specialise(model, blendshapes=50)):
         path = safetensors.to_safetensors(each, tmp_path / "g.safetensors")
         again = safetensors.from_safetensors(path)
         np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(each, motion)[0])

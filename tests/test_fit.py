@@ -19,7 +19,8 @@ import numpy as np
 import optax
 import pytest
 
-from clothjax import checkpoint, fit
+from clothjax.files import checkpoint
+from clothjax.training import loop
 
 SGD = optax.adam(1e-2)
 CONFIG = {"train": {"rate": 1e-2, "steps": 40}, "hidden": (3, 4)}
@@ -71,7 +72,7 @@ def make_update(steps=4, bad_steps=(-1,), slow=0.0):
 
 def train(directory, update=None, config=CONFIG, **options):
     options = {"steps": 40, "steps_per_call": 4, "directory": directory, "config": config} | options
-    return fit.fit(update or make_update(), options.pop("state", None) or initial(), **options)
+    return loop.fit(update or make_update(), options.pop("state", None) or initial(), **options)
 
 
 def rows(directory):

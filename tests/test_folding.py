@@ -10,9 +10,14 @@ from scipy.spatial import cKDTree
 from toy import small
 
 import clothjax as cj
-from clothjax import blendshapes, experiment, folding, garment_model, inference, latent_predictor, skinning, storage
+from clothjax.body import skinning
 from clothjax.export import native
-from clothjax.latent_predictor import Normalizers, Scale
+from clothjax.files import storage
+from clothjax.networks import decoder, psi
+from clothjax.networks.normalisation import Normalizers, Scale
+from clothjax.runtime import inference, specialise
+from clothjax.simulation import assembly
+from clothjax.training import laplacian_shapes
 from clothjax.types import Motion
 
 LATENT = 300  # much wider than the layers around it, as in the thesis
@@ -22,7 +27,7 @@ LATENT = 300  # much wider than the layers around it, as in the thesis
 def motion():
     clip = storage.load_motion("walk_3")
     clip = Motion(clip.rotations, clip.translation.astype(np.float32), clip.fps)
-    return experiment.there_and_back(clip, 1000)
+    return assembly.there_and_back(clip, 1000)
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +50,15 @@ def random_model(skip, excluded=()):
         config,
         stage2=dataclasses.replace(config.stage2, excluded_joints=unseen),
     )
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     rng = np.random.default_rng(0)
-    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    kept = psi.input_joints(whole.names, config.stage2)
     count, constants = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1), 14
-    basis = 0.3 * blendshapes.laplacian(whole.scene, config)
-    garment = garment_model.init(jax.random.key(0), LATENT, basis, config.model)
+    basis = 0.3 * laplacian_shapes.laplacian(whole.scene, config)
+    garment = decoder.init(jax.random.key(0), LATENT, basis, config.model)
     last = garment["decoder"]["dense_1"]
     last |= {"kernel": 50 * last["kernel"], "bias": jnp.asarray(rng.normal(size=last["bias"].shape), jnp.float32)}
-    predictor = latent_predictor.init(jax.random.key(1), LATENT, count, constants, config.stage2)
+    predictor = psi.init(jax.random.key(1), LATENT, count, constants, config.stage2)
     predictor["dense_2"] |= {"kernel": 3 * predictor["dense_2"]["kernel"]}
 
     def scale(size, low, deviation):
@@ -72,13 +77,13 @@ def apart(one, other, motion):
 
 
 def test_a_wide_code_is_folded_away_and_nothing_changes(wide, motion):
-    folded = folding.specialise(wide)
+    folded = specialise.specialise(wide)
     assert folded.network.code.kernel is None and folded.network.read.kernel is None
     assert len(folded.network.first) == 32 + 24
     plain = np.asarray(inference.animate(wide, motion)[0])
     assert np.std(plain[500:600], axis=0).max() > 1e-2
     assert apart(wide, folded, motion).max() < 1e-5  # m, over 1 000 frames
-    again = folding.specialise(folded)
+    again = specialise.specialise(folded)
     assert again.network.first.shape == folded.network.first.shape
 
 
@@ -86,7 +91,7 @@ def test_a_folded_code_is_held_to_what_its_range_becomes(wide, motion):
     narrow = wide.network.code_bounds
     narrow = narrow._replace(low=0 * narrow.low - 0.01, high=0 * narrow.high + 0.01)
     model = dataclasses.replace(wide, network=wide.network._replace(code_bounds=narrow))
-    folded = folding.specialise(model)
+    folded = specialise.specialise(model)
     readers = np.concatenate([wide.network.code.kernel, wide.network.read.kernel], axis=1)
     np.testing.assert_allclose(folded.network.code_bounds.high, 0.01 * np.abs(readers).sum(axis=0), rtol=1e-4)
     vertices, _ = inference.animate(folded, motion)
@@ -95,7 +100,7 @@ def test_a_folded_code_is_held_to_what_its_range_becomes(wide, motion):
 
 def test_a_code_as_wide_as_its_readers_stays():
     model = cj.load("tshirt")
-    folded = folding.specialise(model)
+    folded = specialise.specialise(model)
     assert folded.network.code.kernel is not None
     # no finger and no foot moves a t-shirt
     assert (
@@ -106,7 +111,7 @@ def test_a_code_as_wide_as_its_readers_stays():
 
 def test_exact_folds_of_a_shipped_garment(motion):
     model = cj.load("tshirt", betas=np.linspace(-1, 1, 10))
-    assert apart(model, folding.specialise(model), motion).max() < 1e-5
+    assert apart(model, specialise.specialise(model), motion).max() < 1e-5
 
 
 @pytest.mark.parametrize("kind", ["skip", "relu"])
@@ -116,7 +121,7 @@ def test_fewer_blend_shapes_err_less_the_more_there_are(kind, wide, motion):
     all_of_them = len(model.network.shapes)
     errors = []
     for count in (max(1, all_of_them // 16), all_of_them // 2, all_of_them - 1):
-        fewer = folding.specialise(model, blendshapes=count)
+        fewer = specialise.specialise(model, blendshapes=count)
         assert len(fewer.network.shapes) == count
         errors.append(apart(model, fewer, clip).mean())
     assert errors[0] > errors[1] > errors[2]
@@ -131,26 +136,26 @@ def test_fewer_blend_shapes_err_less_the_more_there_are(kind, wide, motion):
 
 def test_a_specialised_model_keeps_its_shapes(wide):
     with pytest.raises(ValueError, match="give `blendshapes` with the first call"):
-        folding.specialise(folding.specialise(wide), blendshapes=3)
+        specialise.specialise(specialise.specialise(wide), blendshapes=3)
     with pytest.raises(ValueError, match="max_influences must be at least 1, got 0"):
-        folding.specialise(wide, max_influences=0)
+        specialise.specialise(wide, max_influences=0)
 
 
 def test_influences_are_the_largest_and_make_up_one(motion):
     model = cj.load("dress")
     for count in (1, 4):
-        fewer = folding.specialise(model, max_influences=count).network.weights
+        fewer = specialise.specialise(model, max_influences=count).network.weights
         assert (np.count_nonzero(fewer, axis=0) <= count).all()
         np.testing.assert_allclose(fewer.sum(axis=0), 1.0, atol=1e-5)
     clip = Motion(motion.rotations[:60], motion.translation[:60], motion.fps)
-    errors = [apart(model, folding.specialise(model, max_influences=count), clip).max() for count in (2, 4, 8)]
+    errors = [apart(model, specialise.specialise(model, max_influences=count), clip).max() for count in (2, 4, 8)]
     assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-3
 
 
 def test_a_part_of_a_garment_is_that_part(motion):
     model = cj.load("tshirt")
     vertices = np.flatnonzero(model.wearer.template[1] > np.median(model.wearer.template[1]))
-    upper = folding.part(model, vertices)
+    upper = specialise.part(model, vertices)
     clip = Motion(motion.rotations[:20], motion.translation[:20], motion.fps)
     whole = inference.animate(model, clip)[0]
     np.testing.assert_allclose(inference.animate(upper, clip)[0], whole[:, vertices], atol=1e-6)
@@ -164,13 +169,13 @@ def test_a_finer_mesh_moves_with_the_model_and_its_own_mesh_not_at_all(motion):
     model = cj.load("tshirt", betas=betas)
     clip = Motion(motion.rotations[:20], motion.translation[:20], motion.fps)
     body = storage.load_body(model.config.body)
-    same = folding.on_mesh(model, storage.load_garment("tshirt_1000", body), betas)
+    same = specialise.on_mesh(model, storage.load_garment("tshirt_1000", body), betas)
     np.testing.assert_allclose(inference.animate(same, clip)[0], inference.animate(model, clip)[0], atol=2e-5)
     garment = storage.load_garment("tshirt_4000", body)
-    for specialised in (folding.specialise(model), folding.specialise(model, blendshapes=96)):
+    for specialised in (specialise.specialise(model), specialise.specialise(model, blendshapes=96)):
         with pytest.raises(ValueError, match="specialised already: put it on the other mesh first"):
-            folding.on_mesh(specialised, garment, betas)
-    fine = np.asarray(inference.animate(folding.on_mesh(model, garment, betas), clip)[0])
+            specialise.on_mesh(specialised, garment, betas)
+    fine = np.asarray(inference.animate(specialise.on_mesh(model, garment, betas), clip)[0])
     assert fine.shape[1] == len(garment.vertices)
     # it lies on the coarse one: as near to its vertices as at rest
     coarse = np.asarray(inference.animate(model, clip)[0])
@@ -183,7 +188,7 @@ def test_a_finer_mesh_moves_with_the_model_and_its_own_mesh_not_at_all(motion):
 def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
     model = cj.load("skirt")
     garment = storage.load_garment("skirt_4000", storage.load_body(model.config.body))
-    fine = folding.on_mesh(model, garment, np.zeros(10))
+    fine = specialise.on_mesh(model, garment, np.zeros(10))
     still = np.abs(np.asarray(fine.network.shapes).reshape(len(fine.network.shapes), 3, -1)).max(axis=(0, 1)) == 0
     np.testing.assert_array_equal(still, garment.pinned)
 
@@ -194,7 +199,7 @@ def test_fewer_shapes_bear_eight_bits():
     clip = storage.load_motion("walk_3", model.names)
     motion = Motion(clip.rotations[:60], clip.translation[:60].astype(np.float32), clip.fps)
     for count in (192, 64):
-        few = folding.specialise(model, blendshapes=count)
+        few = specialise.specialise(model, blendshapes=count)
         matrix, gain, scale = native.eight_bits(few.network.read.kernel, True)
         rounded = few.network.read._replace(kernel=jnp.asarray((scale[:, None] * matrix * gain).T))
         coarse = dataclasses.replace(few, network=few.network._replace(read=rounded))
@@ -205,12 +210,12 @@ def test_fewer_shapes_bear_eight_bits():
 def test_an_evened_model_is_the_same(wide, motion):
     clip = motion._replace(rotations=motion.rotations[:100], translation=motion.translation[:100])
     beside = random_model(skip=True)
-    folded = [folding.specialise(each) for each in (wide, beside)]
+    folded = [specialise.specialise(each) for each in (wide, beside)]
     assert all(each.network.code.kernel is None for each in folded)
-    for model in (cj.load("skirt"), folding.specialise(cj.load("skirt"), blendshapes=50), wide, beside, *folded):
-        even = folding.evened(model)
+    for model in (cj.load("skirt"), specialise.specialise(cj.load("skirt"), blendshapes=50), wide, beside, *folded):
+        even = specialise.evened(model)
         one, other = (inference.animate(each, clip)[0] for each in (model, even))
         np.testing.assert_allclose(one, other, atol=3e-5)
-        reach = np.abs(folding.ordinary_weights(even)).max(axis=0)
+        reach = np.abs(specialise.ordinary_weights(even)).max(axis=0)
         rows = np.abs(np.asarray(even.network.shapes)).max(axis=1)
         np.testing.assert_allclose(reach, rows, rtol=1e-2, atol=1e-3)

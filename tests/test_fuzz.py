@@ -21,7 +21,9 @@ from test_smpl import PARENTS, recording
 from test_storage import _body, _garment, _spin
 from toy import small, untrained_psi
 
-from clothjax import checkpoint, configuration, features, storage, trained
+from clothjax.files import checkpoint, configuration, storage
+from clothjax.networks import normalisation
+from clothjax.runtime import trained
 
 FEW, MANY = 15, 5000
 NAMES = ["root", "mid", "top"]
@@ -57,7 +59,7 @@ def seeds(tmp_path_factory):
     for name in ("mesh.obj", "mesh.ply", "mesh.stl", "mesh.off", "mesh.glb"):
         ball.export(paths[name])
     _, _, _, garment, predictor, normalizers = untrained_psi(small())
-    phi = {"params": {"garment": garment}, "statistics": {"nodes": features.empty_statistics(3)}}
+    phi = {"params": {"garment": garment}, "statistics": {"nodes": normalisation.empty_statistics(3)}}
     folder = paths["model.npz"].parent
     trained.write(folder, small(), phi, predictor, normalizers)
     (folder / "model.npz").rename(paths["model.npz"])

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import graph_network, solver
 from clothjax.config import Stack
+from clothjax.networks import message_passing, mlp
+from clothjax.physics import solver
 from clothjax.types import EdgeSet
 
 VERTICES, BODY, WIDTH, LAYERS = 30, 5, 4, 3
@@ -27,7 +28,7 @@ def problem():
         return jnp.asarray(random.normal(size=(count, WIDTH)))
 
     inputs = {
-        "params": graph_network.init_processor(jax.random.key(1), STACKS, WIDTH, LAYERS),
+        "params": message_passing.init_processor(jax.random.key(1), STACKS, WIDTH, LAYERS),
         "nodes": latents(VERTICES),
         "edges": {name: latents(len(each.senders)) for name, each in graph.items()},
         "body": latents(BODY),
@@ -36,9 +37,9 @@ def problem():
     slots, active = random.integers(0, BODY, VERTICES), random.random(VERTICES) < 0.5
 
     def loss(inputs, remat):
-        world = graph_network.World(inputs["body"], jnp.asarray(slots), jnp.asarray(active), inputs["pairs"])
+        world = message_passing.World(inputs["body"], jnp.asarray(slots), jnp.asarray(active), inputs["pairs"])
         nodes, edges = inputs["nodes"], inputs["edges"]
-        done = graph_network.process(inputs["params"], STACKS, nodes, edges, world, graph, level, remat=remat)
+        done = message_passing.process(inputs["params"], STACKS, nodes, edges, world, graph, level, remat=remat)
         return jnp.mean(jnp.sin(done)), done
 
     return loss, inputs
@@ -46,7 +47,7 @@ def problem():
 
 @pytest.mark.parametrize("chunk", [7, 1024])
 def test_recomputed_blocks_give_the_same_nodes_and_gradients(monkeypatch, chunk):
-    monkeypatch.setattr(graph_network, "CHUNK", chunk)
+    monkeypatch.setattr(message_passing, "CHUNK", chunk)
     loss, inputs = problem()
     with jax.enable_x64(True):
         inputs = jax.tree.map(solver.to_float64, inputs)
@@ -62,7 +63,7 @@ def test_in_bfloat16_every_product_is_and_nothing_that_is_kept(remat):
     inputs = jax.tree.map(lambda x: x.astype(jnp.float32), inputs)
 
     def rounded(inputs):
-        return loss(inputs | {"params": graph_network.in_bfloat16(inputs["params"])}, remat)
+        return loss(inputs | {"params": mlp.in_bfloat16(inputs["params"])}, remat)
 
     step = jax.grad(rounded, has_aux=True)
     program = str(jax.make_jaxpr(step)(inputs))
@@ -74,16 +75,16 @@ def test_in_bfloat16_every_product_is_and_nothing_that_is_kept(remat):
 
 
 def test_a_product_in_bfloat16_is_that_of_rounded_numbers():
-    params = graph_network.init_dense(jax.random.key(0), 40, 6) | {"bias": jnp.arange(6.0)}
+    params = mlp.init_dense(jax.random.key(0), 40, 6) | {"bias": jnp.arange(6.0)}
     x = jax.random.normal(jax.random.key(1), (50, 40))
-    low = np.asarray(graph_network.dense(graph_network.in_bfloat16({"dense": params})["dense"], x))
+    low = np.asarray(mlp.dense(mlp.in_bfloat16({"dense": params})["dense"], x))
     a, b = (np.asarray(each.astype(jnp.bfloat16), np.float64) for each in (x, params["kernel"]))
     np.testing.assert_allclose(low, a @ b + np.asarray(params["bias"]), rtol=2**-7, atol=2**-7)
-    assert np.abs(low - np.asarray(graph_network.dense(params, x))).max() > 1e-4
+    assert np.abs(low - np.asarray(mlp.dense(params, x))).max() > 1e-4
     many = jnp.ones((12_001, 40))
 
     def total(params):
-        return jnp.sum(graph_network.dense(graph_network.in_bfloat16({"dense": params})["dense"], many))
+        return jnp.sum(mlp.dense(mlp.in_bfloat16({"dense": params})["dense"], many))
 
     np.testing.assert_allclose(jax.grad(total)(params)["bias"], 12_001)  # a sum in bfloat16 would be coarser
 

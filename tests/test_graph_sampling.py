@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from clothjax import graph_sampling, topology
+from clothjax.geometry import mesh_hierarchy, topology
 
 TABLES = Path(__file__).parent / "data" / "graph_sampling.npz"
 GOLDEN = Path(__file__).parents[2] / "shared" / "golden"
@@ -53,16 +53,16 @@ def shirt():
 @pytest.mark.parametrize("centre", [None, 408, 409])
 def test_coarse_levels_equal_hoods(shirt, centre):
     golden, faces = shirt
-    levels = graph_sampling.coarse_levels(faces, 4, centre)
+    levels = mesh_hierarchy.coarse_levels(faces, 4, centre)
     name = f"c{centre or 19}"
     for index, level in enumerate(levels):
         np.testing.assert_array_equal(level, golden[f"{name}_coarse{index}"])
-    np.testing.assert_array_equal(graph_sampling.vertex_levels(4424, levels[:3]), golden[f"{name}_vertex_level3"])
+    np.testing.assert_array_equal(mesh_hierarchy.vertex_levels(4424, levels[:3]), golden[f"{name}_vertex_level3"])
 
 
 def test_the_default_centre_is_hoods_first(shirt):
     golden, faces = shirt
-    centres = graph_sampling.graph_centres(4424, topology.edges(faces))
+    centres = mesh_hierarchy.graph_centres(4424, topology.edges(faces))
     assert centres.tolist() == [golden["center"].min()]
 
 
@@ -72,7 +72,7 @@ def test_centres_have_least_eccentricity_in_each_component():
     hops = distances(48, edges)
     eccentricity = np.where(np.isfinite(hops), hops, 0).max(axis=1)
     labels = topology.components(48, edges)
-    centres = graph_sampling.graph_centres(48, edges)
+    centres = mesh_hierarchy.graph_centres(48, edges)
     assert len(centres) == labels.max() + 1 == 3
     for component, centre in enumerate(centres):
         member = np.flatnonzero(labels == component)
@@ -80,31 +80,31 @@ def test_centres_have_least_eccentricity_in_each_component():
 
 
 def test_approximate_centres_are_nearly_central(monkeypatch):
-    monkeypatch.setattr(graph_sampling, "EXACT_CENTRE", 0)
+    monkeypatch.setattr(mesh_hierarchy, "EXACT_CENTRE", 0)
     faces = np.concatenate([sheet(12, 9), 108 + sheet(20, 4)])
     edges = topology.edges(np.random.default_rng(1).permutation(188)[faces])
     hops = distances(188, edges)
     eccentricity = np.where(np.isfinite(hops), hops, 0).max(axis=1)
     labels = topology.components(188, edges)
-    for component, centre in enumerate(graph_sampling.graph_centres(188, edges)):
+    for component, centre in enumerate(mesh_hierarchy.graph_centres(188, edges)):
         member = labels == component
         assert member[centre] and eccentricity[centre] <= eccentricity[member].min() + 2
 
 
 def test_components_are_coarsened_as_if_alone():
     one, other = sheet(9, 7), sheet(6, 8)
-    together = graph_sampling.coarse_levels(np.concatenate([one, 63 + other]), 3)
-    for a, b, both in zip(*(graph_sampling.coarse_levels(f, 3) for f in (one, other)), together):
+    together = mesh_hierarchy.coarse_levels(np.concatenate([one, 63 + other]), 3)
+    for a, b, both in zip(*(mesh_hierarchy.coarse_levels(f, 3) for f in (one, other)), together):
         np.testing.assert_array_equal(np.concatenate([a, 63 + b]), both)
 
 
 def test_levels_nest_shrink_and_may_be_empty():
     faces = sheet(20, 20)
-    levels = graph_sampling.coarse_levels(faces, 8)
+    levels = mesh_hierarchy.coarse_levels(faces, 8)
     vertices = [set(level.ravel().tolist()) for level in levels]
     assert all(b < a or not a for a, b in zip(vertices, vertices[1:]))
     assert len(vertices[0]) <= 210 and len(levels[-1]) == 0 and levels[-1].shape == (0, 2)
-    level = graph_sampling.vertex_levels(401, levels)
+    level = mesh_hierarchy.vertex_levels(401, levels)
     assert level[400] == 0
     for index, members in enumerate(vertices):
         assert set(np.flatnonzero(level > index).tolist()) == members
@@ -112,7 +112,7 @@ def test_levels_nest_shrink_and_may_be_empty():
 
 def test_a_level_keeps_each_component_in_one_piece():
     faces = sheet(15, 11)
-    for level in graph_sampling.coarse_levels(faces, 3, centre=0):
+    for level in mesh_hierarchy.coarse_levels(faces, 3, centre=0):
         vertices = np.unique(level)
         assert len(np.unique(topology.components(165, level)[vertices])) == 1
 
@@ -123,7 +123,7 @@ def test_tables_equal_the_published_tools(tables, case):
         return tables[f"S_{case}_{name}"]
 
     strides = value("strides").tolist()
-    levels = graph_sampling.hierarchy(
+    levels = mesh_hierarchy.hierarchy(
         value("faces").astype(int),
         int(value("nverts")),
         strides,
@@ -147,7 +147,7 @@ def test_all_tables_equal_the_full_golden_file():
         pytest.skip("../shared/golden/golden_meshconv.npz is not here")
     with np.load(path) as golden:
         for case in CASES:
-            levels = graph_sampling.hierarchy(
+            levels = mesh_hierarchy.hierarchy(
                 golden[f"S_{case}_faces"],
                 int(golden[f"S_{case}_nverts"]),
                 golden[f"S_{case}_strides"].tolist(),
@@ -169,7 +169,7 @@ def test_all_tables_equal_the_full_golden_file():
 @pytest.mark.parametrize("stride, radius", [(1, 1), (2, 2), (2, 1), (3, 2)])
 def test_kept_vertices_are_spaced_and_read_exactly_their_surroundings(stride, radius):
     faces = np.concatenate([sheet(7, 9), 63 + sheet(5, 5)])
-    (level,) = graph_sampling.hierarchy(faces, 90, [stride], [radius])  # two vertices are in no face
+    (level,) = mesh_hierarchy.hierarchy(faces, 90, [stride], [radius])  # two vertices are in no face
     hops = distances(90, topology.edges(faces))
     between = hops[np.ix_(level.kept, level.kept)]
     assert (between[~np.eye(len(between), dtype=bool)] >= stride).all()
@@ -183,7 +183,7 @@ def test_restart_samples_every_component(tables):
     faces, count = tables["S_two_faces"].astype(int), int(tables["S_two_nverts"])
     unread = []
     for restart in (False, True):
-        levels = graph_sampling.hierarchy(faces, count, [2, 2], [2, 2], restart=restart)
+        levels = mesh_hierarchy.hierarchy(faces, count, [2, 2], [2, 2], restart=restart)
         unread.append(count - len(np.unique(levels[0].ids[levels[0].mask])))
     assert unread == [30, 0]
 
@@ -199,11 +199,11 @@ def test_restart_samples_every_component(tables):
 )
 def test_a_wrong_hierarchy_says_what_is_wrong(arguments, words):
     with pytest.raises(ValueError, match=words):
-        graph_sampling.hierarchy(sheet(3, 3), 9, **arguments)
+        mesh_hierarchy.hierarchy(sheet(3, 3), 9, **arguments)
 
 
 def test_a_wrong_centre_or_depth_says_what_is_wrong():
     with pytest.raises(ValueError, match=r"centre is 9.*0 to 8"):
-        graph_sampling.coarse_levels(sheet(3, 3), 1, centre=9)
+        mesh_hierarchy.coarse_levels(sheet(3, 3), 1, centre=9)
     with pytest.raises(ValueError, match="levels is -1"):
-        graph_sampling.coarse_levels(sheet(3, 3), -1)
+        mesh_hierarchy.coarse_levels(sheet(3, 3), -1)

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import graph_network, graph_sampling, hood, topology
-from clothjax.hood import Cloth, State
+from clothjax.geometry import mesh_hierarchy, topology
+from clothjax.networks import hood, message_passing
+from clothjax.networks.hood import Cloth, State
+from clothjax.networks.mlp import _affine, mlp_tail
 
 DATA = Path(__file__).parent / "data" / "hood_rollout.npz"  # of golden_hood_model_small.npz: a grid over a sphere
 PREFIX = "_learned_model."
@@ -82,7 +84,7 @@ def ours(torch: dict[str, np.ndarray]) -> dict:
 
 def cloth(golden) -> Cloth:
     faces, count = golden["faces"], len(golden["rest_pos"])
-    levels = graph_sampling.coarse_levels(faces, 3, centre=int(golden["center"]))
+    levels = mesh_hierarchy.coarse_levels(faces, 3, centre=int(golden["center"]))
     graph = {"mesh": topology.directed(topology.edges(faces))}
     graph |= {f"coarse{i}": topology.directed(level) for i, level in enumerate(levels)}
     rest = golden["rest_pos"]
@@ -98,7 +100,7 @@ def cloth(golden) -> Cloth:
         materials=golden["material_inputs"],
         pinned=np.isin(np.arange(count), golden["pinned"]),
         graph=graph,
-        level=graph_sampling.vertex_levels(count, levels),
+        level=mesh_hierarchy.vertex_levels(count, levels),
         body_faces=golden["body_faces"],
         omitted=np.isin(np.arange(len(golden["roll0_body"][0])), golden["omit"]),
     )
@@ -185,15 +187,15 @@ def test_every_block_is_hoods(golden, shared):
     pair_latents = {"to_body": world("roll2_enc_c2o"), "to_garment": world("roll2_enc_o2c")}
     done = 0
     for stack, stacked, least in zip(hood.SCHEDULE, params["processor"], (0, 1, 2, 1, 0)):
-        rows, graph = graph_network._reached(stack, garment.graph, garment.level)
+        rows, graph = message_passing._reached(stack, garment.graph, garment.level)
         np.testing.assert_array_equal(np.arange(count)[rows], np.flatnonzero(garment.level >= least))
         for index in range(stack.blocks):
             p = jax.tree.map(lambda x, index=index: x[index], stacked)
-            nodes, body, updated, near = graph_network._block(
+            nodes, body, updated, near = message_passing._block(
                 p, nodes, body, {name: edges[name] for name in stack.edges},
                 {name: latents[rows] for name, latents in pair_latents.items()},
                 rows, graph, jnp.asarray(slots[rows]), jnp.asarray(active[rows]),
-                graph_network._mlp_tail,
+                mlp_tail,
             )  # fmt: skip
             edges |= updated
             pair_latents = {name: pair_latents[name].at[rows].set(latents) for name, latents in near.items()}
@@ -211,7 +213,7 @@ def test_the_gradient_of_scale_and_bias_is_jaxs_own():
     def loss(affine):
         return lambda *args: jnp.sum(weight * affine(*args) ** 3)
 
-    ours = jax.grad(loss(graph_network._affine), (0, 1, 2))(x, scale, bias)
+    ours = jax.grad(loss(_affine), (0, 1, 2))(x, scale, bias)
     jaxs = jax.grad(loss(lambda x, s, b: x * s[None] + b[None]), (0, 1, 2))(x, scale, bias)
     for one, other in zip(ours, jaxs):
         np.testing.assert_allclose(one, other, rtol=1e-12)

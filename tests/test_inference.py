@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import experiment, folding, inference, latent_predictor, stage1, stage2, storage
+from clothjax.files import storage
+from clothjax.networks import normalisation, psi
+from clothjax.runtime import inference, specialise
+from clothjax.simulation import assembly
+from clothjax.training import stage1, stage2
 from clothjax.types import Material, Motion, Pose
 
 
@@ -14,15 +18,15 @@ from clothjax.types import Material, Motion, Pose
 def trained():
     """A model after a few steps of both stages: its numbers mean nothing, its code paths all do."""
     config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
     first, _ = stage1.make_update(whole.scene, reel, config, 1, 20)(stage1.init(whole.scene, reel, config))
-    joints = latent_predictor.kept_joints(whole.names, config.stage2)
+    joints = psi.input_joints(whole.names, config.stage2)
     phi = {"params": first.params, "statistics": first.statistics}
     teacher, _ = stage2.teach(phi, whole.scene, reel, joints, config)
     second, _ = stage2.make_update(teacher, config, 20)(stage2.init(teacher, first.params["garment"], config))
     # twelve frames of a teacher span next to nothing: as if it had seen more
-    wide = latent_predictor.Normalizers(*(
+    wide = normalisation.Normalizers(*(
         scale._replace(low=0 * scale.low - 1e6, high=0 * scale.high + 1e6) for scale in second.normalizers
     ))  # fmt: skip
 
@@ -32,7 +36,7 @@ def trained():
             betas=betas, material=material,
         )  # fmt: skip
 
-    clip = experiment.motion(whole, "walk_3")
+    clip = assembly.motion(whole, "walk_3")
     motion = Motion(clip.rotations[:30], clip.translation[:30].astype(np.float32), clip.fps)
     return wearer(np.linspace(-1, 1, 10)), motion, teacher, wearer
 
@@ -81,7 +85,7 @@ def test_a_crowd_is_of_one_garment(trained):
     changed = other.network._replace(shapes=2 * other.network.shapes)
     with pytest.raises(ValueError, match=r"models\[1\] differs from models\[0\] in more than its wearer"):
         inference.crowd([model, dataclasses.replace(other, network=changed)])
-    fewer = [folding.specialise(each, blendshapes=4) for each in (model, other)]
+    fewer = [specialise.specialise(each, blendshapes=4) for each in (model, other)]
     with pytest.raises(ValueError, match="whose blend shapes `specialise` has not fitted"):
         inference.crowd(fewer)
     with pytest.raises(ValueError, match="at least one"):

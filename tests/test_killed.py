@@ -15,8 +15,8 @@ import pytest
 import yaml
 from toy import assert_same, small
 
-from clothjax import checkpoint, configuration
 from clothjax.config import TuningConfig
+from clothjax.files import checkpoint, configuration
 
 TIMES = 50
 STAGES = ("stage1", "stage2", "tuning")

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import graph_sampling, mesh_convolution
+from clothjax.geometry import mesh_hierarchy
+from clothjax.networks import mesh_convolution
 
 DATA = Path(__file__).parent / "data" / "mesh_convolution.npz"  # layers 2, 3 and 4 of the golden chain
 GOLDEN = Path(__file__).parents[2] / "shared" / "golden" / "golden_meshconv.npz"
@@ -28,7 +29,7 @@ def sheet(rows: int, columns: int) -> np.ndarray:
 
 
 def table(stride=2, rows=9, columns=8):
-    return graph_sampling.hierarchy(sheet(rows, columns), rows * columns, [stride], [stride])[0]
+    return mesh_hierarchy.hierarchy(sheet(rows, columns), rows * columns, [stride], [stride])[0]
 
 
 def normal(*shape: int) -> np.ndarray:
@@ -157,7 +158,7 @@ def test_rates_outside_zero_to_one_are_refused():
 
 
 def test_a_new_stack_keeps_the_size_of_smooth_features():
-    levels = graph_sampling.hierarchy(sheet(40, 40), 1600, [2, 2, 1], [2, 2, 1])
+    levels = mesh_hierarchy.hierarchy(sheet(40, 40), 1600, [2, 2, 1], [2, 2, 1])
     place = np.stack(np.meshgrid(np.arange(40), np.arange(40), indexing="ij"), -1).reshape(-1, 2) / 20
     x = np.sqrt(2) * np.cos(place @ normal(2, 48) + 6 * normal(48)).astype(np.float32)
 

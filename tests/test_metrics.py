@@ -7,19 +7,21 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import character as characters
-from clothjax import experiment, losses, metrics, rollout, simulation, stage1
+from clothjax import material
 from clothjax.config import LossConfig, Ramp
-from clothjax.metrics import StepMeasure
-from experiments import evaluate
+from clothjax.evaluation import metrics, rollouts
+from clothjax.evaluation.metrics import StepMeasure
+from clothjax.networks import animators
+from clothjax.simulation import assembly, characters, reference, rollout
+from clothjax.training import loss, stage1
 
 
 @pytest.fixture(scope="module")
 def walking():
     config = dataclasses.replace(small(), motions=("walk_0",))
-    whole = experiment.assemble(config)
-    character = characters.dress(whole.scene, jnp.zeros(10), experiment.material(config), config.physics)
-    poses = evaluate.windows(experiment.motion(whole, "walk_3"))
+    whole = assembly.assemble(config)
+    character = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    poses = rollouts.windows(assembly.motion(whole, "walk_3"))
     return whole, character, poses
 
 
@@ -45,10 +47,10 @@ def test_gaps_are_ratios_of_summed_energies():
 def test_skinning_has_an_energy_gap_of_one_and_the_solver_none(walking):
     whole, character, poses = walking
     short = jax.tree.map(lambda x: x[:8], poses)
-    skinned = evaluate.skinned_trajectory(whole, character, short)
+    skinned = rollouts.skinned_trajectory(whole, character, short)
     gaps = metrics.gaps(metrics.step_measures(whole.scene, character, skinned, short, [5], whole.config))
     assert gaps["energy_gap"] == pytest.approx(1.0, abs=1e-6) and gaps["solver_converged"] == 1.0
-    solved, infos = simulation.simulate(whole.scene, character, short, whole.config)
+    solved, infos = reference.simulate(whole.scene, character, short, whole.config)
     assert len(solved) == 9 and all(info.converged for info in infos)
     gaps = metrics.gaps(metrics.step_measures(whole.scene, character, solved, short, [5], whole.config))
     assert abs(gaps["energy_gap"]) < 1e-3 and gaps["hold_gap"] < 0.05 and gaps["step_error_mm"] < 1.0
@@ -66,7 +68,7 @@ def test_penetration_is_how_deep_inside():
 
 def test_beside_the_solver_itself_nothing_differs(walking):
     whole, character, poses = walking
-    skinned = evaluate.skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:6], poses))
+    skinned = rollouts.skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:6], poses))
     time = np.arange(6)[:, None, None]
     swing = 0.01 * np.sin(time + skinned[:1])
     same = metrics.beside_solver(whole.scene, skinned + swing, skinned + swing, skinned)
@@ -84,7 +86,7 @@ def test_all_of_space_contains_the_minimum(walking):
     """With a blend shape for every coordinate the span's minimum is the solver's, with none but one it is not."""
     whole, character, poses = walking
     short = jax.tree.map(lambda x: x[:8], poses)
-    skinned = evaluate.skinned_trajectory(whole, character, short)
+    skinned = rollouts.skinned_trajectory(whole, character, short)
     size = skinned[0].size
     gap = {}
     for count in (1, 300, size):
@@ -112,22 +114,28 @@ def test_a_term_of_no_weight_is_not_computed():
     names = [field.name for field in dataclasses.fields(LossConfig) if field.name != "scale"]
     terms = dict.fromkeys(names, jnp.float32(1.0)) | {"friction": jnp.float32(jnp.nan)}
     config = LossConfig(friction=Ramp(0.0), inertia=Ramp(3.0, 5.0, 0, 100), scale=1.0)
-    there = losses.present(terms, config)
+    there = loss.present_terms(terms, config)
     assert set(there) == set(names) - {"friction"}
-    assert losses.weighted(there, config, jnp.int32(50)) == pytest.approx(6 + 4.0)
-    assert losses.weighted(there, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
+    assert loss.weighted_loss(there, config, jnp.int32(50)) == pytest.approx(6 + 4.0)
+    assert loss.weighted_loss(there, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
 
 
 def test_pinned_vertices_follow_skinning():
     config = dataclasses.replace(small(), garment="skirt_1000", motions=("walk_0",))
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
     state = stage1.init(whole.scene, reel, config)
-    character = characters.dress(whole.scene, jnp.zeros(10), experiment.material(config), config.physics)
-    poses = jax.tree.map(lambda x: x[:6], evaluate.windows(experiment.motion(whole, "walk_3")))
+    character = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    poses = jax.tree.map(lambda x: x[:6], rollouts.windows(assembly.motion(whole, "walk_3")))
     model = {"params": state.params, "statistics": state.statistics}
-    _, states, _ = jax.jit(lambda m, p: rollout.play(m, whole.scene, character, p, config))(model, poses)
-    skinned = evaluate.skinned_trajectory(whole, character, poses)
+
+    @jax.jit
+    def play(model, poses):
+        animator = animators.phi_animator(model, whole.scene, character, config)
+        return rollout.play(animator, whole.scene, character, poses, config)
+
+    _, states, _ = play(model, poses)
+    skinned = rollouts.skinned_trajectory(whole, character, poses)
     pinned = np.asarray(whole.garment.pinned)
     assert pinned.sum() > 10
     np.testing.assert_allclose(np.asarray(states.position)[:, pinned], skinned[:, pinned], atol=1e-5)

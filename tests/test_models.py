@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 import clothjax as cj
-from clothjax import skinning, storage, topology, trained
+from clothjax.body import skinning
+from clothjax.files import storage
+from clothjax.geometry import topology
+from clothjax.runtime import trained
 from clothjax.types import Motion, Pose
 
 

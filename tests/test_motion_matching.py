@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clothjax import motion_matching, storage
+from clothjax.body import motion_matching
+from clothjax.files import storage
 from clothjax.types import Motion
 
 NAMES = [f"{family}_{i}" for family in ("walk", "run", "arms", "jump") for i in range(2)]

@@ -15,8 +15,8 @@ from test_export import model as shipped
 from test_export import motion as dance
 
 import clothjax as cj
-from clothjax import folding, inference
 from clothjax.export import native, onnx, psi_ffi
+from clothjax.runtime import inference, specialise
 from clothjax.types import Pose
 from experiments import convert
 
@@ -59,8 +59,8 @@ def rounded(model):
 
 def test_c_is_the_model_of_eight_bits_in_closed_loop(library, model, motion, tmp_path):
     """And nearer to the model than ONNX Runtime in eight bits."""
-    few = folding.specialise(model, blendshapes=100, max_influences=3)
-    for each in (model, folding.specialise(model), few):
+    few = specialise.specialise(model, blendshapes=100, max_influences=3)
+    for each in (model, specialise.specialise(model), few):
         found = native.run_c(library, native.to_c(each, tmp_path / "g.psi"), motion)
         assert apart(found, rounded(each), motion).max() < 3e-5
         error = apart(found, each, motion)
@@ -72,7 +72,7 @@ def test_c_of_a_folded_code_and_of_a_relu(library, motion, tmp_path):
     from test_folding import wide
 
     plain = wide.__wrapped__()
-    for each in (plain, folding.specialise(plain), folding.specialise(plain, blendshapes=5)):
+    for each in (plain, specialise.specialise(plain), specialise.specialise(plain, blendshapes=5)):
         found = native.run_c(library, native.to_c(each, tmp_path / "g.psi"), motion)
         assert apart(found, rounded(each), motion).max() < 1e-4
     assert each.network.code.kernel is None and each.network.mix is not None
@@ -199,7 +199,7 @@ def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, cap
     done = subprocess.run([program, out, given, tmp_path / "vertices.bin"], check=True, capture_output=True, text=True)
     assert done.stdout.endswith("us a frame, one thread\n")
     found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(30, -1, 3)
-    skirt = rounded(folding.specialise(cj.load("skirt")))
+    skirt = rounded(specialise.specialise(cj.load("skirt")))
     short = motion._replace(rotations=motion.rotations[:30], translation=motion.translation[:30])
     assert apart(found, skirt, short).max() < 3e-5
     for broken, why in ((given, "not a .psi of this version"), (tmp_path / "none.psi", "cannot be opened")):

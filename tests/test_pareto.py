@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from test_peers import settings
 
-from clothjax import trained
-from experiments import benchmark, train
-from experiments.benchmarks import pareto, variants
-from experiments.evaluate import _stages
+from clothjax.evaluation.report import _stages
+from clothjax.runtime import trained
+from clothjax.training import pipeline
+from experiments.benchmark import pareto, report, variants
 
 
 def point(family: str, us: float, error: float, garment: str = "skirt", name: str = "", **more) -> dict:
@@ -68,9 +68,9 @@ def test_no_point_is_better_than_one_on_the_front():
 def test_what_cannot_be_compared(tmp_path):
     (tmp_path / "old.json").write_text(json.dumps({"inference": {}}))
     with pytest.raises(ValueError, match=r"old\.json: not a report of experiments\.benchmark"):
-        benchmark.earlier(tmp_path / "old.json")
+        report.earlier(tmp_path / "old.json")
     with pytest.raises(ValueError, match="runs are for the part pareto"):
-        benchmark.main(["tshirt", "--part", "inference"])
+        report.main(["tshirt", "--part", "inference"])
 
 
 @pytest.fixture(scope="module", params=["ncs", pytest.param("snug", marks=pytest.mark.slow)])
@@ -79,7 +79,7 @@ def run(request, tmp_path_factory):
     config = settings(request.param, steps=20)
     config = dataclasses.replace(config, evaluation=dataclasses.replace(config.evaluation, betas=1.0))
     folder = tmp_path_factory.mktemp("runs") / request.param
-    train.train(config, folder)
+    pipeline.train(config, folder)
     return folder
 
 
@@ -120,7 +120,7 @@ def test_what_was_trained_for_something_else_is_not_compared(run, monkeypatch):
 
 def test_the_quick_benchmark_of_a_shipped_garment(tmp_path):
     path = tmp_path / "pareto.json"
-    benchmark.main(["tshirt", "--part", "pareto", "--quick", "--json", str(path)])
+    report.main(["tshirt", "--part", "pareto", "--quick", "--json", str(path)])
     points = {p["name"]: p for p in json.loads(path.read_text())["pareto"]["points"]}
     assert {p["family"] for p in points.values()} == {"skinning", "psi", "phi", "solver"}
     assert not any("of the shapes" in name for name in points)  # they take most of the time
@@ -133,11 +133,11 @@ def test_the_quick_benchmark_of_a_shipped_garment(tmp_path):
 
 @pytest.mark.slow
 def test_every_way_of_a_shipped_garment(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "PARETO", {"rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",)})
+    monkeypatch.setattr(report, "PARETO", {"rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",)})
     path, again = tmp_path / "pareto.json", tmp_path / "again.json"
-    benchmark.main(["tshirt", "--part", "pareto", "--json", str(path)])
+    report.main(["tshirt", "--part", "pareto", "--json", str(path)])
     points = {p["name"]: p for p in json.loads(path.read_text())["pareto"]["points"]}
     assert len(points) >= 15
     assert points["phi, 32 steps"]["step_error_mm"] < points["phi, 1 steps"]["step_error_mm"]
-    benchmark.main(["tshirt", "--part", "pareto", "--json", str(again), "--compare", str(path)])
+    report.main(["tshirt", "--part", "pareto", "--json", str(again), "--compare", str(path)])
     assert json.loads(again.read_text())["compare"]["pareto"]["rank_tau"]["us"] > 0.5

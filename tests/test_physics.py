@@ -7,9 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax import contact, losses, physics, proximity, rotation, topology
+from clothjax.body import rotation
 from clothjax.config import PhysicsConfig
-from clothjax.losses import TimeStep
+from clothjax.geometry import proximity, topology
+from clothjax.physics import contact_search, incremental_potential
+from clothjax.physics import energies as energies_module
+from clothjax.physics.energies import (
+    bending,
+    collision,
+    dihedral_angle,
+    friction,
+    gravity,
+    inertia,
+    rest_measures,
+    stretching,
+    vertex_areas,
+)
+from clothjax.physics.incremental_potential import TimeStep
 from clothjax.types import Contact, EdgeContact, Material, SelfContact
 
 DATA = Path(__file__).parent / "data"
@@ -46,8 +60,8 @@ TERMS = (
 
 def time_step(canonical, mesh, flat=False):
     """A step of a sheet that hangs over a sphere and touches it and itself everywhere."""
-    rest = physics.rest_measures(canonical, mesh, flat)
-    mass = physics.vertex_areas(canonical, mesh.faces) * DENSITY
+    rest = rest_measures(canonical, mesh, flat)
+    mass = vertex_areas(canonical, mesh.faces) * DENSITY
     centre = np.array([[0.15, 0.15, -0.3]])
     random = np.random.default_rng(7)
 
@@ -78,27 +92,27 @@ def time_step(canonical, mesh, flat=False):
 
 def all_terms(posed, canonical, mesh, flat=False):
     """Every energy of the sheet, each summed."""
-    return losses.energies(posed, time_step(canonical, mesh, flat), mesh, PhysicsConfig())
+    return incremental_potential.energies(posed, time_step(canonical, mesh, flat), mesh, PhysicsConfig())
 
 
 @pytest.mark.parametrize("roll", range(3))
 def test_hood_energies(hood, roll, x64):
     mesh = topology.mesh(hood["faces"])
-    rest = physics.rest_measures(hood["rest"], mesh)
-    mass = physics.vertex_areas(hood["rest"], mesh.faces) * DENSITY
+    rest = rest_measures(hood["rest"], mesh)
+    mass = vertex_areas(hood["rest"], mesh.faces) * DENSITY
     np.testing.assert_allclose(mass, hood["mass"], rtol=1e-13)
     # HOOD moves pinned vertices to their targets, without velocity, before each step
     now, velocity = hood["cloth"][roll].copy(), hood["velocity"][roll].copy()
     now[hood["pinned"]], velocity[hood["pinned"]] = hood["cloth_target"][roll], 0.0
     new = hood["predicted"][roll]
-    touched = contact.find_at_centroids(now, hood["body"][roll], hood["body_next"][roll], hood["body_faces"])
+    touched = contact_search.find_at_centroids(now, hood["body"][roll], hood["body_next"][roll], hood["body_faces"])
     values = {
-        "stretching_energy": physics.stretching(new[mesh.faces], rest.inverse, rest.face_area, MU, LAM),
-        "bending_energy": physics.bending(new[mesh.hinges], rest.hinge_area, rest.hinge_angle, STIFFNESS),
-        "gravitational_energy": physics.gravity(new[:, 1], mass),
-        "inertia": physics.inertia(new - now - velocity, mass, hood["timestep"][roll]),
+        "stretching_energy": stretching(new[mesh.faces], rest.inverse, rest.face_area, MU, LAM),
+        "bending_energy": bending(new[mesh.hinges], rest.hinge_area, rest.hinge_angle, STIFFNESS),
+        "gravitational_energy": gravity(new[:, 1], mass),
+        "inertia": inertia(new - now - velocity, mass, hood["timestep"][roll]),
         # never in contact here: this one says only that no vertex is found inside
-        "collision_penalty": physics.collision(contact.distance(new, touched.point_next, touched.normal_next), 2e-3),
+        "collision_penalty": collision(contact_search.distance(new, touched.point_next, touched.normal_next), 2e-3),
     }
     expected = dict(zip(hood["loss_names"], hood["losses"][roll]))
     for name, value in values.items():
@@ -113,14 +127,16 @@ def test_hood_friction_with_its_traps(hood, x64):
     roll = 2
     now, new = hood["cloth"][roll].copy(), hood["predicted"][roll]
     now[hood["pinned"]] = hood["cloth_target"][roll]
-    before, after = (contact.centroids(hood[name][roll], hood["body_faces"]) for name in ("body_previous", "body"))
+    before, after = (
+        contact_search.centroids(hood[name][roll], hood["body_faces"]) for name in ("body_previous", "body")
+    )
     p, q = proximity.nearest_point(now, before[0]), proximity.nearest_point(new, after[0])
     near = (np.sum((now - before[0][p]) ** 2, axis=1) < 3e-3) & (np.sum((new - after[0][q]) ** 2, axis=1) < 3e-3)
     slip = new - (now + after[0][p] - before[0][p])
     normal = 0.5 * (before[1][p] + after[1][q])
     z_to_y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     mass = hood["mass"]
-    energy = physics.friction(slip @ z_to_y.T, normal @ z_to_y.T, mass, near, 0.5, smoothing=0.0)
+    energy = friction(slip @ z_to_y.T, normal @ z_to_y.T, mass, near, 0.5, smoothing=0.0)
     expected = dict(zip(hood["loss_names"], hood["losses"][roll]))["friction_energy"]
     assert 0 < near.sum() < len(near)
     np.testing.assert_allclose(jnp.sum(energy), expected, rtol=1e-10)
@@ -139,7 +155,7 @@ def difference(function, x, direction, step):
 def test_gradients_and_hessians_are_those_of_finite_differences(term, x64):
     canonical, posed, mesh = sheet()
     step = jax.tree.map(np.asarray, time_step(canonical, mesh))
-    value = jax.jit(lambda x: losses.energies(x, step, mesh, PhysicsConfig())[term])
+    value = jax.jit(lambda x: incremental_potential.energies(x, step, mesh, PhysicsConfig())[term])
     gradient = jax.jit(jax.grad(value))
     product = jax.jit(lambda x, d: jax.jvp(jax.grad(value), (x,), (d,))[1])
     slope, scale = np.asarray(gradient(posed)), np.linalg.norm(gradient(posed))
@@ -193,13 +209,13 @@ def test_moving_everything_leaves_every_energy_and_turning_everything_all_but_gr
             self_contact=step.self_contact._replace(normal=vector(step.self_contact.normal)),
         )
 
-    before = losses.energies(posed, step, mesh, PhysicsConfig())
+    before = incremental_potential.energies(posed, step, mesh, PhysicsConfig())
     new, there = moved(np.eye(3), shift)
-    after = losses.energies(new, there, mesh, PhysicsConfig())
+    after = incremental_potential.energies(new, there, mesh, PhysicsConfig())
     for name in TERMS:
         np.testing.assert_allclose(after[name], before[name], rtol=1e-12, atol=1e-12, err_msg=name)
     new, there = moved(turn, shift)
-    after = losses.energies(new, there, mesh, PhysicsConfig())
+    after = incremental_potential.energies(new, there, mesh, PhysicsConfig())
     for name in set(TERMS) - {"gravity", "friction"}:
         np.testing.assert_allclose(after[name], before[name], rtol=1e-12, atol=1e-12, err_msg=name)
     assert not np.isclose(after["gravity"], before["gravity"]) and not np.isclose(after["friction"], before["friction"])
@@ -212,11 +228,11 @@ def test_turning_about_the_vertical_leaves_friction_and_gravity(x64):
     mass, touching = random.uniform(1, 2, 20), np.ones(20, bool)
     vertical = np.asarray(rotation.from_axis_angle(np.array([0.0, 0.9, 0.0])))
     tilted = np.asarray(rotation.from_axis_angle(np.array([0.9, 0.0, 0.0])))
-    value = physics.friction(slip, normal, mass, touching)
-    turned = physics.friction(slip @ vertical.T, normal @ vertical.T, mass, touching)
+    value = friction(slip, normal, mass, touching)
+    turned = friction(slip @ vertical.T, normal @ vertical.T, mass, touching)
     np.testing.assert_allclose(turned, value, rtol=1e-12)
     np.testing.assert_allclose((slip @ vertical.T)[:, 1], slip[:, 1], rtol=1e-12)
-    assert not np.allclose(physics.friction(slip @ tilted.T, normal @ tilted.T, mass, touching), value)
+    assert not np.allclose(friction(slip @ tilted.T, normal @ tilted.T, mass, touching), value)
 
 
 def test_renumbering_vertices_changes_nothing(x64):
@@ -224,8 +240,8 @@ def test_renumbering_vertices_changes_nothing(x64):
     old_of_new = np.random.default_rng(3).permutation(len(canonical))
     new_of_old = np.argsort(old_of_new)
     renumbered = topology.mesh(new_of_old[mesh.faces])
-    areas = physics.vertex_areas(canonical, mesh.faces)
-    renumbered_areas = physics.vertex_areas(canonical[old_of_new], renumbered.faces)
+    areas = vertex_areas(canonical, mesh.faces)
+    renumbered_areas = vertex_areas(canonical[old_of_new], renumbered.faces)
     np.testing.assert_allclose(renumbered_areas, areas[old_of_new], rtol=1e-12)
     step = jax.tree.map(np.asarray, time_step(canonical, mesh))
     # the renumbered mesh may hold an edge the other way round, or elsewhere in its list
@@ -238,7 +254,7 @@ def test_renumbering_vertices_changes_nothing(x64):
         position=step.position[old_of_new],
         velocity=step.velocity[old_of_new],
         mass=step.mass[old_of_new],
-        rest=physics.rest_measures(canonical[old_of_new], renumbered, flat=False),
+        rest=rest_measures(canonical[old_of_new], renumbered, flat=False),
         contact=Contact(*(x[old_of_new] for x in step.contact)),
         touching=step.touching[old_of_new],
         edge_contact=EdgeContact(
@@ -252,8 +268,8 @@ def test_renumbering_vertices_changes_nothing(x64):
             step.self_contact.normal[old_of_new],
         ),
     )
-    expected = losses.energies(posed, step, mesh, PhysicsConfig())
-    found = losses.energies(posed[old_of_new], other, renumbered, PhysicsConfig())
+    expected = incremental_potential.energies(posed, step, mesh, PhysicsConfig())
+    found = incremental_potential.energies(posed[old_of_new], other, renumbered, PhysicsConfig())
     for name in TERMS:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-12, err_msg=name)
 
@@ -277,7 +293,7 @@ def test_bending_is_finite_where_hinges_are_singular(size, dtype, x64):
     ones = np.ones(len(hinges), dtype)
 
     def energy(x):
-        values = physics.bending(x, 1e-4 * ones, 0.3 * ones, dtype(1e-5))
+        values = bending(x, 1e-4 * ones, 0.3 * ones, dtype(1e-5))
         return jnp.sum(values), values
 
     gradient, values = jax.jit(jax.grad(energy, has_aux=True))(hinges)
@@ -288,8 +304,8 @@ def test_bending_is_finite_where_hinges_are_singular(size, dtype, x64):
 
 def test_dihedral_angle_of_small_triangles_in_float32():
     hinge = np.array([[A, B, LEFT, [0, -np.cos(1.0), np.sin(1.0)]]], np.float32)
-    large = jax.grad(lambda x: physics.dihedral_angle(x)[0])(hinge)
-    small = jax.grad(lambda x: physics.dihedral_angle(x)[0])(hinge * np.float32(1e-5))
+    large = jax.grad(lambda x: dihedral_angle(x)[0])(hinge)
+    small = jax.grad(lambda x: dihedral_angle(x)[0])(hinge * np.float32(1e-5))
     np.testing.assert_allclose(small * np.float32(1e-5), large, rtol=1e-4, atol=1e-5)
 
 
@@ -307,7 +323,7 @@ def test_stretching_is_finite_where_triangles_are_singular(dtype, x64):
     inverse = np.broadcast_to(np.eye(2, dtype=dtype), (len(triangles), 2, 2))
 
     def energy(x):
-        values = physics.stretching(x, inverse, np.ones(len(x), dtype), dtype(MU), dtype(LAM))
+        values = stretching(x, inverse, np.ones(len(x), dtype), dtype(MU), dtype(LAM))
         return jnp.sum(values), values
 
     gradient, values = jax.jit(jax.grad(energy, has_aux=True))(triangles)
@@ -320,7 +336,7 @@ def test_friction_is_finite_at_any_slip(smoothing):
     normal = np.tile(np.array([[0, 0, 1]], np.float32), (5, 1))
 
     def energy(x):
-        values = physics.friction(x, normal, np.ones(5, np.float32), np.ones(5, bool), 0.5, smoothing)
+        values = friction(x, normal, np.ones(5, np.float32), np.ones(5, bool), 0.5, smoothing)
         return jnp.sum(values), values
 
     gradient, values = jax.jit(jax.grad(energy, has_aux=True))(slip)
@@ -336,25 +352,25 @@ def test_friction_in_closed_form(x64):
     kappa = np.sqrt(1 - np.array([0.0, 1.0, 0.8]) ** 2 + 1e-4)
     expected = 0.5 * 9.81 * 2.0 * kappa * np.array([3e-3, 4e-3, 5e-3])
     everywhere = np.ones(3, bool)
-    np.testing.assert_allclose(physics.friction(slip, normal, mass, everywhere, 0.5, 0.0), expected, rtol=1e-12)
+    np.testing.assert_allclose(friction(slip, normal, mass, everywhere, 0.5, 0.0), expected, rtol=1e-12)
     # smoothing vanishes with its length, to first order
     for smoothing in (1e-6, 1e-7):
-        smooth = physics.friction(slip, normal, mass, everywhere, 0.5, smoothing)
+        smooth = friction(slip, normal, mass, everywhere, 0.5, smoothing)
         np.testing.assert_allclose(smooth, expected, rtol=400 * smoothing)
-    assert (physics.friction(slip, normal, mass, ~everywhere, 0.5, 0.0) == 0).all()
+    assert (friction(slip, normal, mass, ~everywhere, 0.5, 0.0) == 0).all()
 
 
 def test_uniformly_stretched_triangle(x64):
     canonical = np.array([[0.0, 0, 0], [2, 0, 0], [0.5, 1, 0]])
     mesh = topology.mesh(np.array([[0, 1, 2]]))
-    rest = physics.rest_measures(canonical, mesh)
+    rest = rest_measures(canonical, mesh)
     stretch = np.diag([1.1, 0.8, 1.0])
     # G = (F^T F - I) / 2 in any orthonormal basis of the plane
     strain = 0.5 * (np.diag([1.1**2, 0.8**2]) - np.eye(2))
     density = MU * np.sum(strain**2) + 0.5 * LAM * np.trace(strain) ** 2
-    energy = physics.stretching((canonical @ stretch)[None], rest.inverse, rest.face_area, MU, LAM)
+    energy = stretching((canonical @ stretch)[None], rest.inverse, rest.face_area, MU, LAM)
     np.testing.assert_allclose(energy, 1.0 * 4.7e-4 * density, rtol=1e-12)
-    still = physics.stretching(canonical[None], rest.inverse, rest.face_area, MU, LAM)
+    still = stretching(canonical[None], rest.inverse, rest.face_area, MU, LAM)
     np.testing.assert_allclose(still, 0.0, atol=1e-25)
 
 
@@ -362,9 +378,9 @@ def test_uniformly_stretched_triangle(x64):
 def test_known_dihedral_angle(angle, x64):
     fold = [1.0, np.cos(np.pi - angle), np.sin(np.pi - angle)]
     hinge = np.array([[[0, 0, 0], [2, 0, 0], [1, 1, 0], fold]])
-    np.testing.assert_allclose(np.abs(physics.dihedral_angle(hinge)), abs(angle), atol=1e-14)
+    np.testing.assert_allclose(np.abs(dihedral_angle(hinge)), abs(angle), atol=1e-14)
     # l^2 / (4 A) theta^2 / 2 with l = 2 and, to test that it is used, A = 5
-    energy = physics.bending(hinge, np.array([5.0]), np.zeros(1), 3.0)
+    energy = bending(hinge, np.array([5.0]), np.zeros(1), 3.0)
     np.testing.assert_allclose(energy, 3.0 * 4 / 20 * angle**2 / 2, atol=1e-13)
 
 
@@ -378,7 +394,7 @@ def test_free_fall_is_the_minimum_of_gravity_and_inertia(x64):
     mass, dt = np.array([0.3]), 1 / 30
 
     def energy(x):
-        return (physics.gravity(x[:, 1], mass) + physics.inertia(x, mass, dt))[0]
+        return (gravity(x[:, 1], mass) + inertia(x, mass, dt))[0]
 
     gradient = jax.grad(energy)(np.array([[0.0, -9.81 * dt**2, 0.0]]))
     np.testing.assert_allclose(gradient, 0.0, atol=1e-14)
@@ -386,7 +402,7 @@ def test_free_fall_is_the_minimum_of_gravity_and_inertia(x64):
 
 def test_collision_is_the_cube_of_the_penetration(x64):
     distance = np.array([-2e-3, 0.0, 2.999e-3, 3e-3, 1.0])
-    np.testing.assert_allclose(physics.collision(distance), [1.25e-7, 2.7e-8, 1e-18, 0.0, 0.0], rtol=1e-6, atol=1e-30)
+    np.testing.assert_allclose(collision(distance), [1.25e-7, 2.7e-8, 1e-18, 0.0, 0.0], rtol=1e-6, atol=1e-30)
 
 
 def test_an_edge_collides_where_it_touches(x64):
@@ -397,10 +413,10 @@ def test_an_edge_collides_where_it_touches(x64):
     touched = EdgeContact(place, ridge, up)
     config = PhysicsConfig()
     depth = config.collision_offset - (0.75 * 0.05 - 0.25 * 0.03 - 0.031)
-    energy = losses.edge_collision(ends, touched, config)
+    energy = incremental_potential.edge_collision(ends, touched, config)
     np.testing.assert_allclose(energy, config.collision_stiffness * depth**3, rtol=1e-12)
     # three quarters of the push at the near end, along the normal
-    gradient = jax.grad(losses.edge_collision)(ends, touched, config)
+    gradient = jax.grad(incremental_potential.edge_collision)(ends, touched, config)
     slope = -3 * config.collision_stiffness * depth**2
     np.testing.assert_allclose(gradient, [slope * 0.75 * up, slope * 0.25 * up], rtol=1e-12)
 
@@ -410,13 +426,15 @@ def test_a_vertex_keeps_its_distance_from_a_triangle(x64):
     points = np.array([[0.01, 5e-4, 0.01], [0, 0, 0], [0.04, 0, 0], [0, 0, 0.04]])
     weights = np.array([0.5, 0.25, 0.25])
     touched = SelfContact(np.arange(1, 4), weights, np.array([0.0, 1, 0]))
-    np.testing.assert_allclose(losses.self_collision(points, touched, config), 1e5 * 1.5e-3**3, rtol=1e-12)
-    gradient = np.asarray(jax.grad(losses.self_collision)(points, touched, config))
+    np.testing.assert_allclose(
+        incremental_potential.self_collision(points, touched, config), 1e5 * 1.5e-3**3, rtol=1e-12
+    )
+    gradient = np.asarray(jax.grad(incremental_potential.self_collision)(points, touched, config))
     push = 3 * 1e5 * 1.5e-3**2
     np.testing.assert_allclose(gradient[:, 1], push * np.array([-1, 0.5, 0.25, 0.25]), rtol=1e-12)
     np.testing.assert_allclose(gradient.sum(axis=0), 0.0, atol=1e-12)  # what one pushes, the other feels
     apart = points + np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
-    assert losses.self_collision(apart, touched, config) == 0
+    assert incremental_potential.self_collision(apart, touched, config) == 0
 
 
 def test_cloth_that_is_not_the_same_everywhere(x64):
@@ -425,15 +443,14 @@ def test_cloth_that_is_not_the_same_everywhere(x64):
     step = time_step(canonical, mesh)
 
     def energies(cloth, material=step.material):
-        rest, areas = physics.regional(step.rest, physics.vertex_areas(canonical, mesh.faces), mesh, cloth)
+        rest, areas = energies_module.regional(step.rest, vertex_areas(canonical, mesh.faces), mesh, cloth)
         regional = step._replace(rest=rest, mass=areas * DENSITY, material=material)
-        return losses.elements(new, regional, mesh, PhysicsConfig())
+        return incremental_potential.elements(new, regional, mesh, PhysicsConfig())
 
     as_it_is, everywhere = energies(np.ones((len(canonical), 3))), np.array([1.5, 4.0, 20.0])
     other = step._replace(mass=1.5 * step.mass, material=Material(1.5 * DENSITY, 4 * MU, 4 * LAM, 20 * STIFFNESS))
-    found, expected = (
-        energies(np.tile(everywhere, (len(canonical), 1))), losses.elements(new, other, mesh, PhysicsConfig()),
-    )  # fmt: skip
+    found = energies(np.tile(everywhere, (len(canonical), 1)))
+    expected = incremental_potential.elements(new, other, mesh, PhysicsConfig())
     for name in expected:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-12, err_msg=name)
     cloth = np.random.default_rng(3).uniform(0.1, 10.0, (len(canonical), 3))
@@ -447,13 +464,13 @@ def test_cloth_that_is_not_the_same_everywhere(x64):
 
 def test_rest_measures_are_those_of_numpy(x64):
     canonical, _, mesh = sheet()
-    rest = physics.rest_measures(canonical, mesh, flat=False)
+    rest = rest_measures(canonical, mesh, flat=False)
     area = np.array([0.5 * np.linalg.norm(np.cross(b - a, c - a)) for a, b, c in canonical[mesh.faces]])
     np.testing.assert_allclose(rest.face_area, area, rtol=1e-12)
     vertex_area = np.zeros(len(canonical))
     for face, value in zip(mesh.faces, area):
         vertex_area[face] += value / 3
-    np.testing.assert_allclose(physics.vertex_areas(canonical, mesh.faces), vertex_area, rtol=1e-12)
+    np.testing.assert_allclose(vertex_areas(canonical, mesh.faces), vertex_area, rtol=1e-12)
     for hinge, hinge_area, hinge_angle in zip(mesh.hinges, rest.hinge_area, rest.hinge_angle):
         a, b, c, d = canonical[hinge]
         first, second = np.cross(b - a, c - a), np.cross(d - a, b - a)

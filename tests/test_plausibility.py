@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clothjax import plausibility
+from clothjax.body import plausibility
 from clothjax.types import Body, Motion
 
 JOINTS = np.array([[0, 0, 0], [0, 0.5, 0], [0, 1, 0]], np.float32)

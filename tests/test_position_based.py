@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import character as characters
-from clothjax import experiment, metrics, physics, topology
-from experiments.benchmarks import position_based
-from experiments.engines import scene
+from clothjax.evaluation import metrics
+from clothjax.geometry import topology
+from clothjax.material import configured_material
+from clothjax.physics import energies
+from clothjax.simulation import assembly, characters
+from experiments.benchmark import position_based
+from experiments.compare_solvers.engines import scene
 
 MU, LAM = 2.4e4, 2.4e4  # Pa: alike, for which springs and a membrane have one Poisson's ratio, 1/3
 
@@ -24,16 +27,16 @@ def test_springs_are_the_membrane_when_both_are_widened():
     lengths = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
     springs = 0.5 * np.sum(stiffness * (strain * lengths) ** 2)
     with jax.enable_x64(True):
-        rest = physics.rest_measures(jnp.asarray(flat), topology.mesh(faces))
+        rest = energies.rest_measures(jnp.asarray(flat), topology.mesh(faces))
         wide = (1 + strain) * jnp.asarray(flat)[faces]
-        membrane = physics.stretching(wide, rest.inverse, rest.face_area, MU, LAM).sum()
+        membrane = energies.stretching(wide, rest.inverse, rest.face_area, MU, LAM).sum()
     assert springs == pytest.approx(float(membrane), rel=1e-3)
 
 
 def wears(garment):
     pytest.importorskip("newton")
-    whole = experiment.assemble(dataclasses.replace(small(), garment=garment))
-    material = experiment.material(whole.config)._replace(bending=jnp.zeros(()))  # or pleats unfold as they fall
+    whole = assembly.assemble(dataclasses.replace(small(), garment=garment))
+    material = configured_material(whole.config)._replace(bending=jnp.zeros(()))  # or pleats unfold as they fall
     character = characters.dress(whole.scene, jnp.zeros(10), material, whole.config.physics)
     engine = position_based.Xpbd(whole, character, substeps=32, iterations=2)
     return whole, engine, np.asarray(character.template, np.float64), np.asarray(character.body)
@@ -42,7 +45,7 @@ def wears(garment):
 def test_what_nothing_holds_falls():
     whole, engine, now, body = wears("tshirt_1000")
     new = engine.step(now, np.zeros_like(now), now, np.stack([body + [0.0, 50.0, 0.0]] * 2))
-    fallen = 0.5 * physics.GRAVITY / whole.config.fps**2 * (1 + 1 / 32)  # the implicit steps that Newton takes
+    fallen = 0.5 * energies.GRAVITY / whole.config.fps**2 * (1 + 1 / 32)  # the implicit steps that Newton takes
     np.testing.assert_allclose(new, now - [0.0, fallen, 0.0], atol=0.01 * fallen)
 
 

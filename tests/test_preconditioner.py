@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import clips as motion
-from clothjax import experiment, losses, preconditioner, rollout, stage1
+from clothjax.body import motion_clips
 from clothjax.config import Range
+from clothjax.networks import animators
+from clothjax.physics import incremental_potential
+from clothjax.simulation import assembly, rollout
+from clothjax.training import pool, preconditioner, stage1
 
 
 @pytest.mark.slow
@@ -19,9 +22,9 @@ def test_the_descent_goes_further_with_the_hessian_of_cloth_that_is_worn():
         motions=("walk_0",),
         model=dataclasses.replace(config.model, descent_samples=8, descent_steps=6, latent=128, blendshapes=100),
     )
-    whole = experiment.assemble(config)
+    whole = assembly.assemble(config)
     scene = whole.scene
-    reel, _ = experiment.training_clips(whole)
+    reel, _ = assembly.training_clips(whole)
     state = stage1.init(scene, reel, config)
     model = {"params": state.params, "statistics": state.statistics}
     inverse = preconditioner.measure(model, scene, reel, config)
@@ -35,14 +38,15 @@ def test_the_descent_goes_further_with_the_hessian_of_cloth_that_is_worn():
     @jax.jit
     def energies(key, params):
         """After a step from the end of a loop of the first parameters, taken with the others."""
-        simulation = stage1.begin(key, scene, reel, config)
-        character = stage1.wearer(scene, simulation.betas, simulation.material, config)
-        poses = motion.there_and_back(reel, simulation.frame, 10)
-        _, states, _ = rollout.play(model, scene, character, poses, config)
+        simulation = pool.begin(key, scene, reel, config)
+        character = pool.dressed(scene, simulation.betas, simulation.material, config)
+        poses = motion_clips.there_and_back(reel, simulation.frame, 10)
+        phi = animators.phi_animator(model, scene, character, config)
+        _, states, _ = rollout.play(phi, scene, character, poses, config)
         cloth, window = jax.tree.map(lambda x: x[-1], (states, poses))
-        animate = rollout.phi({"params": params, "statistics": state.statistics}, scene, character, config)
+        animate = animators.phi_animator({"params": params, "statistics": state.statistics}, scene, character, config)
         _, (new, step, _) = rollout.take(animate, scene, character, cloth, window, 1 / config.fps, config)
-        return losses.potential(new, step, scene.mesh, config.physics)
+        return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
     keys = jax.random.split(jax.random.key(9), 6)
     at_rest, worn = (
@@ -62,8 +66,8 @@ def test_loops_that_all_blow_up_are_reported():
         model=dataclasses.replace(config.model, descent_samples=1),
         material=dataclasses.replace(config.material, mu_range=Range(1e30, 1e30)),
     )
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
     state = stage1.init(whole.scene, reel, config)
     with pytest.raises(ValueError, match="no closed loop of an untrained Phi stayed finite"):
         preconditioner.measure({"params": state.params, "statistics": state.statistics}, whole.scene, reel, config)

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import blendshapes, experiment, principal_shapes, sampling
 from clothjax.config import ShapesConfig
+from clothjax.simulation import assembly
+from clothjax.training import laplacian_shapes, principal_shapes, sampling
 
 
 @pytest.fixture(scope="module")
 def skirt():
     config = dataclasses.replace(small(), garment="skirt_1000", motions=("walk_0",))
     config = dataclasses.replace(config, shapes=ShapesConfig(sequences=2, frames=5, descent_steps=6))
-    whole = experiment.assemble(config)
-    return whole, experiment.training_clips(whole)[0]
+    whole = assembly.assemble(config)
+    return whole, assembly.training_clips(whole)[0]
 
 
 def of(whole, **changed):
@@ -50,7 +51,7 @@ def test_the_components_span_what_was_simulated(skirt, monkeypatch):
     np.testing.assert_allclose(first.T @ weights, frames.reshape(8, -1).T, atol=1e-3)
     np.testing.assert_array_equal(shapes[8:], 0.0)  # of eight frames
     # as large as smooth shapes: each costs 1 J
-    network = blendshapes.springs(whole.scene, whole.config)
+    network = laplacian_shapes.springs(whole.scene, whole.config)
     for shape in first.reshape(3, count, 3)[:, network.free]:
         assert np.trace(shape.T @ (network.matrix @ shape)) == pytest.approx(1.0, rel=1e-5)
     # the largest comes first

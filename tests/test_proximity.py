@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_contact import icosphere
 
-from clothjax import proximity
+from clothjax.geometry import proximity
 
 
 def brute_force(positions, points):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clothjax import storage
-from clothjax.plausibility import bad_frames, joint_positions
+from clothjax.body.plausibility import bad_frames, joint_positions
+from clothjax.files import storage
 from clothjax.types import Motion
 from data_prep.repair import longest, mend
 

@@ -9,8 +9,10 @@ import pytest
 from test_peers import settings
 from toy import small
 
-from clothjax import checkpoint, configuration, experiment, stage1
 from clothjax.config import Config, TuningConfig
+from clothjax.files import checkpoint, configuration
+from clothjax.simulation import assembly
+from clothjax.training import pipeline, stage1
 from experiments import replay, train
 
 
@@ -18,12 +20,12 @@ from experiments import replay, train
 def test_the_first_bad_step_is_named_and_kept(tmp_path, monkeypatch, capsys):
     config = dataclasses.replace(small(), motions=("walk_0", "run_0"))
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, restart_probability=0.0))
-    whole = experiment.assemble(config)
-    state = stage1.init(whole.scene, experiment.training_clips(whole)[0], config)
+    whole = assembly.assemble(config)
+    state = stage1.init(whole.scene, assembly.training_clips(whole)[0], config)
     pool = state.pool
     # the third simulation, whose turn is the third step, stretches without bounds
     spoiled = pool.cloth._replace(velocity=pool.cloth.velocity.at[2].set(1e30))
-    frames = jnp.array([5, 60, len(experiment.motion(whole, "walk_0").translation) + 7], jnp.int32)
+    frames = jnp.array([5, 60, len(assembly.motion(whole, "walk_0").translation) + 7], jnp.int32)
     state = state._replace(pool=pool._replace(cloth=spoiled, frame=frames, fresh=jnp.zeros(3, bool)))
     checkpoint.save(tmp_path / "stage1" / "checkpoints", 0, state, configuration.to_dict(config))
     for start in ("checkpoints", "diverged"):  # again, from what the first has kept
@@ -61,11 +63,11 @@ def test_the_first_bad_step_is_named_and_kept(tmp_path, monkeypatch, capsys):
 def test_a_finished_stage_is_not_replayed_and_a_peers_and_a_tuning_are(tmp_path, capsys):
     quick = TuningConfig(steps=20, pool=2, restart_probability=0.1)
     config = dataclasses.replace(small(), motions=("walk_0",), tuning=quick)
-    train.train(config, tmp_path / "ours")
+    pipeline.train(config, tmp_path / "ours")
     with pytest.raises(ValueError, match="tuning has taken all of its 20 steps"):
         replay.main([str(tmp_path / "ours")])
     peer = settings("ncs", steps=20)
-    train.train(peer, tmp_path / "ncs")
+    pipeline.train(peer, tmp_path / "ncs")
     for run, stage in (("ours", "tuning"), ("ncs", "stage1")):
         # as if it had been stopped: the same state, with more steps to come
         folder = tmp_path / run / stage / "checkpoints"
@@ -79,5 +81,5 @@ def test_a_finished_stage_is_not_replayed_and_a_peers_and_a_tuning_are(tmp_path,
 
 
 def whole_of(config: dict):
-    whole = experiment.assemble(configuration.from_dict(Config, config, "a checkpoint"))
-    return whole, experiment.training_clips(whole)[0]
+    whole = assembly.assemble(configuration.from_dict(Config, config, "a checkpoint"))
+    return whole, assembly.training_clips(whole)[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clothjax import rotation
+from clothjax.body import rotation
 
 ANGLES = [0.0, 1e-8, 1e-4, 0.999e-3, 1.001e-3, 0.5, np.pi - 1e-6, np.pi, np.pi + 1e-3, 6.0]
 AXIS = np.array([0.48, -0.6, 0.64])

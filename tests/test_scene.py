@@ -8,26 +8,36 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import blendshapes, clips, experiment, inference, losses, rollout, scene, simulation, stage1, storage
-from clothjax import character as characters
+from clothjax import material
+from clothjax.body import motion_clips
+from clothjax.evaluation.report import evaluate
 from clothjax.export.onnx import run_onnx, to_onnx
+from clothjax.files import storage
+from clothjax.networks import animators
+from clothjax.physics import incremental_potential
+from clothjax.runtime import inference
+from clothjax.simulation import assembly, characters, reference, rollout, time_step
+from clothjax.simulation.scene import build_scene
+from clothjax.training import laplacian_shapes, pipeline, stage1
+from clothjax.training.loss import weighing
+from clothjax.training.pool import dressed
 from clothjax.types import Garment, Motion
-from data_prep import garment as garments
-from experiments import evaluate, render, train
-from experiments.benchmarks import scenes
-from experiments.benchmarks.timing import cost, program
+from data_prep.garment import build
+from experiments import render
+from experiments.benchmark import scenes
+from experiments.benchmark.timing import cost, program
 
 
 @pytest.fixture(scope="module")
 def whole():
     config = dataclasses.replace(small(), motions=("walk_0",))
-    return experiment.assemble(dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1)))
+    return assembly.assemble(dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1)))
 
 
 @pytest.fixture(scope="module")
 def flops(whole):
     """Of a frame of a training rollout in every scene, with its losses."""
-    reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
+    reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
     counted = {}
     for name in scenes.SCENES:
         built = scenes.build(whole, name)
@@ -35,12 +45,12 @@ def flops(whole):
 
         def loss(params, statistics, pool, clips, built=built):
             one = jax.tree.map(lambda x: x[0], pool)
-            character = stage1.wearer(built.scene, one.betas, one.material, built.config)
+            character = dressed(built.scene, one.betas, one.material, built.config)
             model = {"params": params, "statistics": statistics}
-            phi = rollout.phi(model, built.scene, character, built.config)
+            phi = animators.phi_animator(model, built.scene, character, built.config)
             return rollout.training_rollout(
                 phi, built.scene, character, one.cloth, clips, one.frame, one.fresh,
-                jnp.int32(0), 1, built.config,
+                1, built.config, weighing(built.config.loss, jnp.int32(0)),
             )[0]  # fmt: skip
 
         counted[name] = cost(program(loss, state.params, state.statistics, state.pool, reel))["flops"]
@@ -62,17 +72,17 @@ def test_every_scene_costs_less_than_the_full_one(flops):
 
 def _step(whole, pose):
     config, built = whole.config, whole.scene
-    character = characters.dress(built, jnp.zeros(10), experiment.material(config), config.physics)
+    character = characters.dress(built, jnp.zeros(10), material.configured_material(config), config.physics)
     window = characters.window(built, character, pose)
-    state = rollout.start(character, window, 0)
-    step = jax.jit(lambda: rollout.time_step(built, character, state, window, 1.0 / config.fps, config))()
+    state = time_step.start(character, window, 0)
+    step = jax.jit(lambda: time_step.time_step(built, character, state, window, 1.0 / config.fps, config))()
     return step, character
 
 
 @pytest.fixture(scope="module")
 def pose(whole):
-    reel = jax.tree.map(jnp.asarray, experiment.windows(experiment.motion(whole, "walk_0")))
-    return clips.poses(reel, jnp.int32(20))
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "walk_0")))
+    return motion_clips.poses(reel, jnp.int32(20))
 
 
 @pytest.mark.parametrize(
@@ -88,7 +98,7 @@ def pose(whole):
 def test_the_energies_of_a_scene(whole, pose, name, missing):
     changed = scenes.build(whole, name)
     step, _ = _step(changed, pose)
-    found = losses.energies(step.position, step, changed.scene.mesh, changed.config.physics)
+    found = incremental_potential.energies(step.position, step, changed.scene.mesh, changed.config.physics)
     assert set(found) == {
         "stretching", "bending", "gravity", "inertia", "friction", "collision", "edge_collision"
     } - missing  # fmt: skip
@@ -105,7 +115,7 @@ def test_elements_among_pinned_vertices_are_left_out_and_not_missed(whole, pose)
     new = step.position + 1e-3 * np.random.default_rng(0).standard_normal(step.position.shape).astype(np.float32)
 
     def force(step, mesh):
-        return np.asarray(jax.grad(lambda x: losses.potential(x, step, mesh, whole.config.physics))(new))
+        return np.asarray(jax.grad(lambda x: incremental_potential.potential(x, step, mesh, whole.config.physics))(new))
 
     free = force(_step(whole, pose)[0], every)[~held]
     np.testing.assert_allclose(force(step, some)[~held], free, atol=1e-5 * np.abs(free).max())
@@ -117,11 +127,11 @@ def test_a_flag_falls_from_its_pole(whole):
     config = flag.config
     still = storage.load_motion("walk_3", whole.names)
     still = Motion(np.repeat(still.rotations[:1], 14, 0), np.repeat(still.translation[:1], 14, 0), still.fps)
-    reel = jax.tree.map(jnp.asarray, experiment.windows(still))
-    poses = jax.vmap(lambda t: clips.poses(reel, t))(jnp.arange(1, 13))
-    character = characters.dress(flag.scene, jnp.zeros(10), experiment.material(config), config.physics)
+    reel = jax.tree.map(jnp.asarray, assembly.windows(still))
+    poses = jax.vmap(lambda t: motion_clips.poses(reel, t))(jnp.arange(1, 13))
+    character = characters.dress(flag.scene, jnp.zeros(10), material.configured_material(config), config.physics)
     quick = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, start_timestep=0.0))
-    track, infos = simulation.simulate(flag.scene, character, poses, quick)
+    track, infos = reference.simulate(flag.scene, character, poses, quick)
     assert all(info.converged for info in infos) and np.isfinite(track).all()
     held = np.asarray(flag.garment.pinned)
     np.testing.assert_allclose(track[-1, held], track[0, held], atol=1e-6)
@@ -132,7 +142,7 @@ def test_a_flag_falls_from_its_pole(whole):
 def test_a_still_body_refuses_a_motion(whole):
     table = scenes.build(whole, "cloth_on_a_table")
     with pytest.raises(ValueError, match=r"walk_0 moves, but physics\.body is `still`"):
-        experiment.motion(table, "walk_0")
+        assembly.motion(table, "walk_0")
 
 
 def test_one_shape_for_all_is_the_shape_it_was_modelled_in(whole):
@@ -142,14 +152,14 @@ def test_one_shape_for_all_is_the_shape_it_was_modelled_in(whole):
         stage1=dataclasses.replace(config.stage1, betas=0.0),
         material=dataclasses.replace(config.material, sample=False),
     )
-    drawn = stage1.sample_material(jax.random.key(3), config)
+    drawn = material.sample_material(jax.random.key(3), config)
 
     def total(config, betas):
-        character = stage1.wearer(whole.scene, betas, drawn, config)
+        character = dressed(whole.scene, betas, drawn, config)
         return [jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(character._replace(betas=betas))]
 
     one = jax.jit(lambda: total(fixed, jnp.zeros(10)))()
-    configured = characters.dress(whole.scene, jnp.zeros(10), experiment.material(config), config.physics)
+    configured = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
     other = [jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(configured)]
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
@@ -162,7 +172,7 @@ def test_parts_of_other_cloth_are_worn(whole):
     def worn(scene):
         config = whole.config
         return jax.jit(
-            lambda b: characters.dress(scene, b, experiment.material(config), config.physics)
+            lambda b: characters.dress(scene, b, material.configured_material(config), config.physics)
         )(jnp.zeros(10))  # fmt: skip
 
     plain, parted = worn(whole.scene), worn(other.scene)
@@ -177,7 +187,7 @@ def test_parts_of_other_cloth_are_worn(whole):
 
 def _of(whole, garment):
     """The same experiment with another garment."""
-    return whole._replace(garment=garment, scene=scene.build(garment, whole.body, whole.config))
+    return whole._replace(garment=garment, scene=build_scene(garment, whole.body, whole.config))
 
 
 def _takes_a_step(whole):
@@ -199,13 +209,13 @@ def _two_pieces(garment: Garment) -> Garment:
 
 @pytest.mark.slow
 def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
-    small = garments.build("tshirt", 300, whole.body, whole.names)
+    small = build("tshirt", 300, whole.body, whole.names)
     count = len(small.vertices)
     assert abs(count - 300) < 30
     double = _of(whole, _two_pieces(small))
     _takes_a_step(double)
     config = dataclasses.replace(double.config, model=dataclasses.replace(double.config.model, blendshapes=6))
-    basis = blendshapes.laplacian(double.scene, config).reshape(6, -1)
+    basis = laplacian_shapes.laplacian(double.scene, config).reshape(6, -1)
     for piece in (slice(0, count), slice(count, None)):  # to move one of them alone is in the span of the basis
         alone = np.zeros((2 * count, 3), np.float32)
         alone[piece, 0] = 1.0
@@ -215,7 +225,7 @@ def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
 
 @pytest.mark.slow
 def test_a_large_garment_trains(whole):
-    large = garments.build("tshirt", 20000, whole.body, whole.names)
+    large = build("tshirt", 20000, whole.body, whole.names)
     assert abs(len(large.vertices) / 20000 - 1) < 0.1
     _takes_a_step(_of(whole, large))
 
@@ -231,7 +241,7 @@ def test_the_basis_is_the_dense_solvers(whole):
     count, density, timestep = 12, whole.config.material.density, 1 / 30
     stiffness = 0.25 * 4.7e-4 * (2 * whole.config.material.mu + whole.config.material.lam)
     config = dataclasses.replace(whole.config, model=dataclasses.replace(whole.config.model, blendshapes=count))
-    basis = blendshapes.laplacian(whole.scene, config)[::3, :, 0]
+    basis = laplacian_shapes.laplacian(whole.scene, config)[::3, :, 0]
     vertices = np.asarray(whole.garment.vertices, np.float64)
     matrix, mass = np.zeros((len(vertices),) * 2), np.zeros(len(vertices))
     for face in whole.garment.faces:
@@ -259,13 +269,13 @@ def test_a_flag_goes_all_the_way(tmp_path):
         physics=dataclasses.replace(config.physics, body="none", without=("friction",)),
         material=dataclasses.replace(config.material, sample=False),
     )
-    train.train(config, tmp_path)
-    report = evaluate.evaluate(tmp_path)["evaluation"]
+    pipeline.train(config, tmp_path)
+    report = evaluate(tmp_path)["evaluation"]
     assert report["psi"]["finite"] and "penetration_percent" not in report["psi"]
     render.main([str(tmp_path), "--motion", "walk_3", "--out", str(tmp_path / "flag.webp"), "--frames", "3"])
     render.main([str(tmp_path), "--motion", "walk_3", "--out", str(tmp_path / "flag.glb"), "--frames", "3"])
     model = inference.load(tmp_path)
-    clip = storage.load_motion("walk_3", experiment.assemble(config).names)
+    clip = storage.load_motion("walk_3", assembly.assemble(config).names)
     clip = Motion(clip.rotations[:20], clip.translation[:20].astype(np.float32), clip.fps)
     vertices, _ = inference.animate(model, clip)
     assert np.isfinite(vertices).all()

@@ -7,8 +7,9 @@ import scipy.optimize
 from test_contact import limb
 from test_solver import MATERIAL, sheet, time_step
 
-from clothjax import contact, losses, physics, proximity, solver, topology
 from clothjax.config import PhysicsConfig
+from clothjax.geometry import proximity, topology
+from clothjax.physics import contact_search, energies, incremental_potential, solver
 
 CONFIG = PhysicsConfig()
 
@@ -50,15 +51,15 @@ def test_a_swinging_sheet_only_loses_energy():
     step = time_step(vertices, mesh)
     totals = []
     for _ in range(25):
-        fall = np.array([0.0, -physics.GRAVITY / 900, 0.0])
+        fall = np.array([0.0, -energies.GRAVITY / 900, 0.0])
         guess = np.where(pinned[:, None], step.position, step.position + step.velocity + fall)
         new, info = solver.solve_step(guess, step, mesh, pinned, CONFIG)
         assert info.ok
         velocity = new - step.position
         with jax.enable_x64(True):
-            terms = losses.energies(new, step, mesh, CONFIG)
+            terms = incremental_potential.energies(new, step, mesh, CONFIG)
         kinetic = 0.5 * np.sum(step.mass * np.sum(velocity**2, axis=1)) * 900
-        potential = physics.GRAVITY * np.sum(step.mass * new[:, 1])
+        potential = energies.GRAVITY * np.sum(step.mass * new[:, 1])
         totals.append(kinetic + potential + float(terms["stretching"] + terms["bending"]))
         step = step._replace(position=new, velocity=velocity)
     assert (np.diff([0.0, *totals]) < 1e-12).all()
@@ -76,8 +77,8 @@ def test_a_coarse_sheet_rests_on_a_bar_thinner_than_its_edges_if_these_touch(edg
     free = np.zeros(len(vertices), bool)
     for _ in range(12):
         positions = step.position.astype(np.float32)
-        planes = contact.find(positions, bar, bar, patches)
-        at_edges = contact.find_at_edges(positions, planes, mesh, bar, bar, patches) if edges else None
+        planes = contact_search.find(positions, bar, bar, patches)
+        at_edges = contact_search.find_at_edges(positions, planes, mesh, bar, bar, patches) if edges else None
         step = step._replace(contact=planes, edge_contact=at_edges)
         new, info = solver.solve_step(step.position + step.velocity, step, mesh, free, CONFIG)
         assert info.converged
@@ -103,7 +104,7 @@ def test_torn_or_sunken_cloth_is_not_ok_though_it_is_a_minimum():
     step = time_step(vertices, mesh, ground=0.02)
     _, info = solver.solve_step(vertices, step, mesh, np.zeros(len(vertices), bool), soft)
     assert info.converged and not info.ok
-    np.testing.assert_allclose(info.depth, 0.02 + physics.GRAVITY / 900, rtol=1e-3)
+    np.testing.assert_allclose(info.depth, 0.02 + energies.GRAVITY / 900, rtol=1e-3)
     # what is pinned there is no fault of the cloth's
     _, info = solver.solve_step(vertices, step, mesh, np.ones(len(vertices), bool), soft)
     assert info.ok and info.depth == 0
@@ -121,7 +122,7 @@ def test_self_contact_keeps_two_layers_apart():
     for on in (True, False):
         step = time_step(both, double)
         for _ in range(6):
-            found = contact.find_on_self(step.position.astype(np.float32), patches) if on else None
+            found = contact_search.find_on_self(step.position.astype(np.float32), patches) if on else None
             step = step._replace(self_contact=found)
             guess = np.where(pinned[:, None], step.position, step.position + step.velocity)
             new, info = solver.solve_step(guess, step, double, pinned, CONFIG)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clothjax import skinning
+from clothjax.body import skinning
 from clothjax.types import Body, Garment, Pose
 
 PARENTS = np.array([-1, 0, 1, 2, 1, 4, 0], np.int32)

@@ -10,7 +10,8 @@ import scipy.sparse
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from clothjax import plausibility, skinning, storage
+from clothjax.body import plausibility, skinning
+from clothjax.files import storage
 from clothjax.types import Pose
 from data_prep import amass, retarget, smpl
 

@@ -7,9 +7,10 @@ import pytest
 import scipy.optimize
 import scipy.sparse
 
-from clothjax import losses, physics, solver, topology
 from clothjax.config import PhysicsConfig
-from clothjax.losses import TimeStep
+from clothjax.geometry import topology
+from clothjax.physics import energies, incremental_potential, solver
+from clothjax.physics.incremental_potential import TimeStep
 from clothjax.types import Contact, EdgeContact, Material, SelfContact
 
 CONFIG = PhysicsConfig()
@@ -38,8 +39,8 @@ def time_step(
 ):
     """A step over level ground at height `ground` m, in float64."""
     with jax.enable_x64(True):
-        rest = jax.tree.map(np.asarray, physics.rest_measures(vertices, mesh))
-        areas = np.asarray(physics.vertex_areas(vertices, mesh.faces))
+        rest = jax.tree.map(np.asarray, energies.rest_measures(vertices, mesh))
+        areas = np.asarray(energies.vertex_areas(vertices, mesh.faces))
     position = vertices if position is None else position
     up, under = np.zeros_like(position), position.copy()
     up[:, 1], under[:, 1] = 1.0, ground
@@ -91,7 +92,7 @@ def nothing_pinned(step):
 
 def potential(step, mesh):
     with jax.enable_x64(True):
-        function = jax.jit(jax.value_and_grad(lambda x: losses.potential(x, step, mesh, CONFIG)))
+        function = jax.jit(jax.value_and_grad(lambda x: incremental_potential.potential(x, step, mesh, CONFIG)))
 
     def evaluate(flat):
         with jax.enable_x64(True):
@@ -108,7 +109,7 @@ def test_free_fall():
     start = vertices + 0.005 * np.random.default_rng(0).standard_normal(vertices.shape)
     new, info = solver.solve_step(start, step, mesh, nothing_pinned(step), CONFIG, tolerance=1e-9)
     assert info.converged
-    fall = np.array([0.0, -physics.GRAVITY * DT**2, 0.0])
+    fall = np.array([0.0, -energies.GRAVITY * DT**2, 0.0])
     np.testing.assert_allclose(new, vertices + velocity + fall, atol=1e-9)
 
 
@@ -121,8 +122,8 @@ def test_a_hanging_sheet_pulls_at_its_pins_with_its_weight(x64):
     new, info = solver.solve_step(hanging, step, mesh, pinned, CONFIG, tolerance=1e-8)
     assert info.converged
     still = step._replace(mass=np.zeros_like(step.mass))
-    force = -np.asarray(jax.grad(losses.potential)(new, still, mesh, CONFIG))
-    weight = physics.GRAVITY * step.mass
+    force = -np.asarray(jax.grad(incremental_potential.potential)(new, still, mesh, CONFIG))
+    weight = energies.GRAVITY * step.mass
     np.testing.assert_allclose(force[~pinned, 1], weight[~pinned], rtol=1e-5)
     np.testing.assert_allclose(force[pinned].sum(axis=0), [0, -weight[~pinned].sum(), 0], atol=1e-6)
     np.testing.assert_array_equal(new[pinned], hanging[pinned])
@@ -139,7 +140,7 @@ def test_a_dropped_sheet_rests_on_the_ground():
     assert info.converged
     # 3 k (offset - y)^2 = g m + m y / dt^2, vertex by vertex; the sheet is so soft that it changes little
     mass = step.mass.sum() / len(vertices)
-    a, b, c = 3 * CONFIG.collision_stiffness, physics.GRAVITY * mass, mass / DT**2
+    a, b, c = 3 * CONFIG.collision_stiffness, energies.GRAVITY * mass, mass / DT**2
     depth = CONFIG.collision_offset - np.linspace(0, 3e-3, 100001)
     height = CONFIG.collision_offset - depth[np.argmin(np.abs(a * depth**2 - b - c * (3e-3 - depth)))]
     np.testing.assert_allclose(new[:, 1].mean(), height, atol=1e-5)
@@ -151,7 +152,7 @@ def test_the_gradient_vanishes_where_it_says():
     new, info = solver.solve_step(step.position, step, mesh, pinned, CONFIG, tolerance=1e-6)
     value, gradient = potential(step, mesh)(new)
     gradient = gradient.reshape(-1, 3)[~pinned]
-    weights = physics.GRAVITY * step.mass[~pinned]
+    weights = energies.GRAVITY * step.mass[~pinned]
     assert info.converged and info.relative_gradient <= 1e-6
     np.testing.assert_allclose(np.linalg.norm(gradient), info.gradient_norm, rtol=1e-6)
     np.testing.assert_allclose(info.relative_gradient, info.gradient_norm / np.linalg.norm(weights), rtol=1e-12)

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 from toy import small
 
-from clothjax import experiment, physics
+from clothjax.physics import energies
+from clothjax.simulation import assembly
 from clothjax.types import Motion
-from experiments import stability
-from experiments.stress import closed_loop
-from experiments.stress import physics as energies
-from experiments.stress import solver as cases
+from experiments.stability import closed_loop, physics, solver
+from experiments.stability.report import readable
 
 
 def test_no_term_has_a_value_a_gradient_or_a_hessian_product_that_is_not_finite():
-    counts = energies.count_nonfinite(2000, seed=1)
+    counts = physics.count_nonfinite(2000, seed=1)
     assert set(counts) == {*("stretching", "bending", "gravity", "inertia", "friction", "collision"), "edge_collision",
                            "self_collision", "contact"}  # fmt: skip
     for name, term in counts.items():
@@ -27,13 +26,13 @@ def test_a_careless_energy_is_found(monkeypatch):
     def careless(deviation, mass, timestep):
         return mass * jnp.linalg.norm(deviation, axis=-1) ** 2 / (2 * timestep * timestep)
 
-    monkeypatch.setattr(physics, "inertia", careless)
-    term = energies.count_nonfinite(2000)["inertia"]
+    monkeypatch.setattr(energies, "inertia", careless)
+    term = physics.count_nonfinite(2000)["inertia"]
     assert term["energy"] == 0 and term["gradient"] > 0
 
 
 def test_degenerate_elements_are_among_the_configurations():
-    elements = energies.points(np.random.default_rng(0), 2000, 3)
+    elements = physics.points(np.random.default_rng(0), 2000, 3)
     a, b, c = np.moveaxis(elements, 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     assert ((a == b) & (b == c)).all(axis=1).sum() > 100  # a point
@@ -43,7 +42,7 @@ def test_degenerate_elements_are_among_the_configurations():
 
 @pytest.mark.parametrize("away", [0.0, 100.0])
 def test_float32_is_as_good_as_it_can_be_near_the_origin_and_far(away):
-    errors = energies.precision(small(), away)
+    errors = physics.precision(small(), away)
     assert len(errors) == 8
     for name, error in errors.items():
         assert error["value"] != 0, name
@@ -51,22 +50,22 @@ def test_float32_is_as_good_as_it_can_be_near_the_origin_and_far(away):
 
 
 def test_a_sum_that_cancels_is_found_far_from_the_origin(monkeypatch):
-    from clothjax import losses
+    from clothjax.physics import incremental_potential as losses
 
     def absolute(ends, contact, config):
         place = ends[..., 0, :] + contact.place[..., None] * (ends[..., 1, :] - ends[..., 0, :])
         distance = jnp.sum(place * contact.normal_next, axis=-1) - jnp.sum(
             contact.point_next * contact.normal_next, axis=-1
         )
-        return config.collision_stiffness * physics.collision(distance, config.collision_offset)
+        return config.collision_stiffness * energies.collision(distance, config.collision_offset)
 
     monkeypatch.setattr(losses, "edge_collision", absolute)
-    assert energies.precision(small(), 100.0)["edge_collision"]["gradient"] > 1e-4
+    assert physics.precision(small(), 100.0)["edge_collision"]["gradient"] > 1e-4
 
 
 def test_the_sixteen_materials_are_the_corners_of_the_ranges():
     config = small()
-    found = {tuple(float(x) for x in material) for material in cases.corners(config)}
+    found = {tuple(float(x) for x in material) for material in solver.corners(config)}
     assert len(found) == 16
     low = np.float32([config.material.density_range.low, config.material.mu_range.low])
     assert {value[0] for value in found} == {float(low[0]), float(np.float32(config.material.density_range.high))}
@@ -75,7 +74,7 @@ def test_the_sixteen_materials_are_the_corners_of_the_ranges():
 
 @pytest.mark.slow
 def test_the_solver_recovers_or_says_that_it_did_not():
-    outcomes = cases.stress(small(), 2, True, lambda done: None)
+    outcomes = solver.stress(small(), 2, True, lambda done: None)
     assert len(outcomes) == 7
     assert [name for name, outcome in outcomes.items() if outcome.result == "silent"] == []
     assert outcomes["usual"].result == "recovered"
@@ -115,8 +114,8 @@ def test_shocks_are_at_their_frame_and_nowhere_else():
 
 @pytest.mark.parametrize("fps", [15.0, 60.0, 90.0])
 def test_a_motion_at_another_rate_is_where_it_was_at_that_time(fps):
-    whole = experiment.assemble(dataclasses.replace(small(), motions=("walk_0",)))
-    clip = experiment.motion(whole, "walk_3")
+    whole = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
+    clip = assembly.motion(whole, "walk_3")
     other = closed_loop.at_rate(clip, fps)
     assert other.fps == fps
     step = round(fps / 15)
@@ -143,5 +142,5 @@ def test_a_report_without_a_run_is_readable():
         "solver": {"outcomes": {"usual": {"seconds": 0.5, "iterations": 3, "strain": 0.1, "inside": 0.0,
                                           "result": "recovered"}}},
     }  # fmt: skip
-    text = stability.readable(report)
+    text = readable(report)
     assert "| bending | 5 | 3 | 1e-08, gradient 2e-07 |" in text and "| usual | 0.50 | 3 |" in text

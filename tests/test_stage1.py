@@ -6,17 +6,22 @@ import numpy as np
 import pytest
 from toy import assert_same, small
 
-from clothjax import character as characters
-from clothjax import clips, configuration, experiment, fit, rollout, stage1
+from clothjax import material
+from clothjax.body import motion_clips
 from clothjax.config import Config
+from clothjax.files import configuration
+from clothjax.networks import animators
+from clothjax.simulation import assembly, characters, rollout
+from clothjax.training import loop, stage1
+from clothjax.training.loss import weighing
 
 
 @pytest.fixture(scope="module")
 def toy():
     config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, steps=400, lost=5e3))
-    whole = experiment.assemble(config)
-    reel, _ = experiment.training_clips(whole)
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
     return whole, reel
 
 
@@ -34,7 +39,7 @@ def test_a_killed_and_resumed_training_ends_bit_for_bit_like_one_that_was_not(to
     def run(folder, steps):
         state = stage1.init(whole.scene, reel, config)
         kept = configuration.to_dict(config)
-        return fit.fit(update, state, steps=steps, steps_per_call=1, directory=tmp_path / folder, config=kept).state
+        return loop.fit(update, state, steps=steps, steps_per_call=1, directory=tmp_path / folder, config=kept).state
 
     straight = run("straight", 40)
     run("stopped", 20)
@@ -88,10 +93,11 @@ def _play(whole, reel, params, motion, advance_turn):
         rotations=np.concatenate([np.einsum("ab,tbc->tac", advance_turn, motion.rotations[:, 0])[:, None],
                                   motion.rotations[:, 1:]], axis=1).astype(np.float32),
     )  # fmt: skip
-    poses = jax.tree.map(jnp.asarray, experiment.windows(moved))
-    poses = jax.vmap(lambda t: clips.poses(poses, t))(jnp.arange(1, 20))
-    character = characters.dress(scene, jnp.zeros(10), experiment.material(config), config.physics)
-    new, states, _ = jax.jit(lambda poses: rollout.play(params, scene, character, poses, config))(poses)
+    poses = jax.tree.map(jnp.asarray, assembly.windows(moved))
+    poses = jax.vmap(lambda t: motion_clips.poses(poses, t))(jnp.arange(1, 20))
+    character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    phi = animators.phi_animator(params, scene, character, config)
+    new, states, _ = jax.jit(lambda poses: rollout.play(phi, scene, character, poses, config))(poses)
     np.testing.assert_allclose(states.change[1:], np.diff(states.latent, axis=0), atol=1e-6)
     np.testing.assert_array_equal(states.change[0], 0.0)  # not what settling changed
     return np.asarray(new), np.asarray(character.joints[0])
@@ -103,7 +109,7 @@ def test_phi_does_not_see_place_or_heading(toy, update):
     for _ in range(20):
         state, _ = update(state)
     model = {"params": state.params, "statistics": state.statistics}
-    motion = experiment.motion(whole, "walk_0")
+    motion = assembly.motion(whole, "walk_0")
     angle = 1.1
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     plain, root = _play(whole, reel, model, motion, np.eye(3))
@@ -125,7 +131,9 @@ def _untrained(whole, reel):
 
 
 def _phi(whole, state, params, character):
-    return rollout.phi({"params": params, "statistics": state.statistics}, whole.scene, character, whole.config)
+    return animators.phi_animator(
+        {"params": params, "statistics": state.statistics}, whole.scene, character, whole.config
+    )
 
 
 def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
@@ -138,11 +146,11 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
     def one_update(state, cloth):
         return rollout.training_rollout(
             _phi(whole, state, state.params, character), scene, character, cloth, reel, one.frame, jnp.asarray(True),
-            state.step, 1, config,
+            1, config, weighing(config.loss, state.step),
         )  # fmt: skip
 
     _, (cloth, terms, _) = one_update(state, one.cloth)
-    window = characters.window(scene, character, clips.poses(reel, one.frame))
+    window = characters.window(scene, character, motion_clips.poses(reel, one.frame))
     skinned = characters.skinned(character, window.current)
     # an untrained network hardly moves the cloth: it stays where it was skinned and keeps the body's velocity
     assert float(jnp.max(jnp.linalg.norm(cloth.position - skinned, axis=-1))) < 0.02
@@ -166,7 +174,7 @@ def test_gradients_go_through_as_many_frames_as_configured(toy):
         def loss(params):
             return rollout.training_rollout(
                 _phi(whole, state, params, character), scene, character, one.cloth, reel, one.frame, jnp.asarray(False),
-                state.step, 2, dataclasses.replace(config, stage1=stage),
+                2, dataclasses.replace(config, stage1=stage), weighing(config.loss, state.step),
             )[0]  # fmt: skip
 
         value, gradients = jax.jit(jax.value_and_grad(loss))(state.params)
@@ -204,7 +212,7 @@ def test_losses_and_the_gradient_of_their_mean(monkeypatch, count, backend):
 
 def test_materials_are_drawn_from_their_ranges():
     config = Config()
-    drawn = jax.vmap(lambda key: stage1.sample_material(key, config))(jax.random.split(jax.random.key(0), 500))
+    drawn = jax.vmap(lambda key: material.sample_material(key, config))(jax.random.split(jax.random.key(0), 500))
     for values, limits in zip(
         drawn,
         (config.material.density_range, config.material.mu_range, config.material.lam_range,

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clothjax import plausibility, storage
+from clothjax.body import plausibility
+from clothjax.files import storage
 from clothjax.types import Body, Garment, Motion
 
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from toy import small
 
-from clothjax import configuration
+from clothjax.files import configuration
 from experiments import sweep
 
 

@@ -10,8 +10,8 @@ import yaml
 from test_peers import settings
 from toy import small
 
-from clothjax import checkpoint, configuration, storage
 from clothjax.config import Config, TuningConfig
+from clothjax.files import checkpoint, configuration, storage
 from experiments import thesis
 
 

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from toy import small, untrained_psi
 
-from clothjax import character as characters
-from clothjax import clips as motion
-from clothjax import experiment, inference, latent_predictor, stage1, tuning
+from clothjax import material
+from clothjax.body import motion_clips
 from clothjax.config import Config, LossConfig, Ramp, TuningConfig
-from clothjax.latent_predictor import Normalizers, Scale
+from clothjax.networks import animators, normalisation
+from clothjax.networks.normalisation import Normalizers, Scale
+from clothjax.runtime import inference
+from clothjax.simulation import assembly, characters
+from clothjax.simulation.rollout import StepInput
+from clothjax.training import fine_tuning, stage1
 from clothjax.types import ClothState, Pose
 
 
@@ -31,7 +35,7 @@ def test_psi_in_training_is_psi_in_use(toy):
     model = inference.build(
         config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=betas
     )
-    clip = experiment.motion(whole, "walk_0")
+    clip = assembly.motion(whole, "walk_0")
     pose = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(5)]
     state = inference.initial_state(model, pose[0])
     for t in range(3):
@@ -40,15 +44,15 @@ def test_psi_in_training_is_psi_in_use(toy):
     at_bounds = np.isclose(np.abs(following.latent), 0.1)
     assert at_bounds.any() and not at_bounds.all() and not following.ok
 
-    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
-    animate = tuning.psi(garment, normalizers, kept)({"params": predictor}, whole.scene, character, config)
-    around = motion.poses(jax.tree.map(jnp.asarray, experiment.windows(clip)), 2)
+    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
+    animate = animators.psi_animator(garment, normalizers, kept)({"params": predictor}, whole.scene, character, config)
+    around = motion_clips.poses(jax.tree.map(jnp.asarray, assembly.windows(clip)), 2)
     window = characters.window(whole.scene, character, around)
-    code = latent_predictor.denormalise(normalizers.latent, state.latent)
+    code = normalisation.denormalise(normalizers.latent, state.latent)
     cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code, 0 * code)
-    new, latent, seen = jax.jit(lambda c: animate(c, around, window, None, None))(cloth)
+    new, latent, seen = jax.jit(lambda c: animate.step(StepInput(c, around, window, None, None)))(cloth)
     assert seen is None
-    np.testing.assert_allclose(latent_predictor.normalise(normalizers.latent, latent), following.latent, atol=1e-5)
+    np.testing.assert_allclose(normalisation.normalise(normalizers.latent, latent), following.latent, atol=1e-5)
     np.testing.assert_allclose(new + pose[2].translation[None], vertices, atol=2e-5)
 
 
@@ -58,22 +62,24 @@ def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
         Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6))
         for n in (len(normalizers.latent.mean), len(normalizers.pose.mean))
     ))  # fmt: skip
-    config = tuning.settings(whole.config)
-    state = tuning.init(predictor, whole.scene, reel, whole.config)
+    config = fine_tuning.settings(whole.config)
+    state = fine_tuning.init(predictor, whole.scene, reel, whole.config)
     assert jax.tree.structure(state.params) == jax.tree.structure(predictor) and not state.statistics
-    update = stage1.make_update(whole.scene, reel, config, 1, 40, animator=tuning.psi(garment, normalizers, kept))
+    update = stage1.make_update(
+        whole.scene, reel, config, 1, 40, animator=animators.psi_animator(garment, normalizers, kept)
+    )
     state, metrics = update(state)
     assert np.isfinite(metrics["loss"]).all() and int(state.step) == 40
     # the same simulations once more, by the predictor that they have trained
-    _, again = update(tuning.init(state.params, whole.scene, reel, whole.config))
+    _, again = update(fine_tuning.init(state.params, whole.scene, reel, whole.config))
     assert np.mean(again["loss"]) < 0.95 * np.mean(metrics["loss"])
 
 
 def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
     whole, reel, kept, garment, predictor, normalizers = toy
     config, betas = whole.config, jnp.linspace(-1, 1, 10)
-    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
-    poses = motion.poses(reel, 5)
+    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
+    poses = motion_clips.poses(reel, 5)
     window = characters.window(whole.scene, character, poses)
     size = len(normalizers.latent.mean)
     root = np.random.default_rng(0).normal(size=(size, size))
@@ -82,12 +88,16 @@ def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
     cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), *(jnp.zeros(size) for _ in range(2)))
 
     def found(inverse):
-        code = None if inverse is None else tuning.code_preconditioner(inverse, normalizers, 0.5)
-        make = tuning.psi(garment, normalizers, kept, tuning.Preconditioners(jnp.eye(len(normalizers.pose.mean)), code))
+        code = None if inverse is None else fine_tuning.code_preconditioner(inverse, normalizers, 0.5)
+        make = animators.psi_animator(
+            garment, normalizers, kept, animators.Preconditioners(jnp.eye(len(normalizers.pose.mean)), code)
+        )
 
         def energy(bias):
             params = predictor | {last: predictor[last] | {"bias": bias}}
-            new, code, _ = make({"params": params}, whole.scene, character, config)(cloth, poses, window, None, None)
+            new, code, _ = make({"params": params}, whole.scene, character, config).step(
+                StepInput(cloth, poses, window, None, None)
+            )
             return jnp.sum((new - 1.0) ** 2), code
 
         return jax.jit(jax.value_and_grad(energy, has_aux=True))(predictor[last]["bias"])
@@ -95,7 +105,7 @@ def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
     (plain, code), gradient = found(None)
     (same, same_code), preconditioned = found(inverse)
     assert plain == same and (code == same_code).all()
-    expected = tuning.code_preconditioner(inverse, normalizers, 0.5) @ gradient
+    expected = fine_tuning.code_preconditioner(inverse, normalizers, 0.5) @ gradient
     np.testing.assert_allclose(preconditioned, expected, rtol=1e-3, atol=1e-3 * float(jnp.abs(expected).max()))
     assert float(jnp.abs(expected - gradient).max()) > 0.1 * float(jnp.abs(gradient).max())
 
@@ -109,38 +119,40 @@ def test_preconditioned_gradients_point_to_the_minimum():
     code, best = jnp.asarray(rng.normal(size=6), jnp.float32), jnp.asarray(rng.normal(size=6), jnp.float32)
 
     def energy(code, matrix=None):
-        code = code if matrix is None else tuning.precondition(matrix, code)
+        code = code if matrix is None else animators.precondition(matrix, code)
         apart = (code - best) * scale.deviation
         return 0.5 * apart @ jnp.asarray(stiffness, jnp.float32) @ apart
 
     def alignment(power):
-        matrix = tuning.code_preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), power)
+        matrix = fine_tuning.code_preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), power)
         assert energy(code, matrix) == energy(code)
         gradient, way = jax.grad(energy)(code, matrix), code - best
         return float(gradient @ way / jnp.linalg.norm(gradient) / jnp.linalg.norm(way))
 
     assert alignment(1.0) > 0.999
     assert alignment(0.0) < alignment(0.5) < alignment(1.0)
-    plain = tuning.code_preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
+    plain = fine_tuning.code_preconditioner(np.linalg.inv(stiffness), Normalizers(scale, scale), 0.0)
     np.testing.assert_allclose(plain, np.eye(6), atol=1e-5)
 
 
 def test_the_first_layer_learns_from_preconditioned_poses_and_predicts_from_poses(toy):
     whole, reel, kept, garment, predictor, normalizers = toy
     config, betas = whole.config, jnp.linspace(-1, 1, 10)
-    character = characters.dress(whole.scene, betas, experiment.material(config), config.physics)
-    poses = motion.poses(reel, 5)
+    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
+    poses = motion_clips.poses(reel, 5)
     window = characters.window(whole.scene, character, poses)
     size, count = len(normalizers.latent.mean), len(normalizers.pose.mean)
     matrix = jnp.asarray(np.random.default_rng(0).normal(size=(count, count)), jnp.float32)
     cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), *(jnp.zeros(size) for _ in range(2)))
 
     def found(matrix):
-        gradients = None if matrix is None else tuning.Preconditioners(matrix, None)
-        make = tuning.psi(garment, normalizers, kept, gradients)
+        gradients = None if matrix is None else animators.Preconditioners(matrix, None)
+        make = animators.psi_animator(garment, normalizers, kept, gradients)
 
         def energy(params):
-            new, code, _ = make({"params": params}, whole.scene, character, config)(cloth, poses, window, None, None)
+            new, code, _ = make({"params": params}, whole.scene, character, config).step(
+                StepInput(cloth, poses, window, None, None)
+            )
             return jnp.sum((new - 1.0) ** 2), code
 
         return jax.jit(jax.value_and_grad(energy, has_aux=True))(predictor)
@@ -159,11 +171,11 @@ def test_preconditioned_poses_tell_velocities_as_loudly_as_places():
     rng = np.random.default_rng(0)
     place, velocity = rng.normal(size=(2, 20_000))
     poses = np.stack([place, place + 0.2 * velocity, rng.normal(size=20_000)], axis=1)
-    matrix = np.asarray(tuning.pose_preconditioner(poses, 0.5))
+    matrix = np.asarray(fine_tuning.pose_preconditioner(poses, 0.5))
     seen = poses @ matrix
     covariance = np.cov(seen.T)
     np.testing.assert_allclose(covariance, np.eye(3) * np.trace(np.cov(poses.T)) / 3, atol=0.1)
-    np.testing.assert_allclose(tuning.pose_preconditioner(poses, 0.0), np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(fine_tuning.pose_preconditioner(poses, 0.0), np.eye(3), atol=1e-5)
 
 
 def test_tuning_has_the_last_loss_weights_and_the_bodies_of_stage_1():
@@ -173,6 +185,6 @@ def test_tuning_has_the_last_loss_weights_and_the_bodies_of_stage_1():
         stage1=dataclasses.replace(Config().stage1, betas=1.25),
         tuning=TuningConfig(steps=10, rollout=3),
     )
-    used = tuning.settings(config)
+    used = fine_tuning.settings(config)
     assert used.loss.collision == Ramp(80.0) and used.loss.inertia == Ramp(3.0) and used.loss.scale == config.loss.scale
     assert used.stage1.betas == 1.25 and used.stage1.rollout == 3 and used.stage1.learning_rate == 1.5e-4

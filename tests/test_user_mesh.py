@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from clothjax import storage
-from data_prep import dressing, mesh, user_mesh
-from data_prep import garment as program
+from clothjax.files import storage
+from data_prep import dressing, garment, user_mesh
+from data_prep.mesh import boundary_mask
 from data_prep.user_mesh import Answers, bring
 
 
@@ -184,7 +184,7 @@ def test_a_second_skin_is_pushed_out(body):
 
 def test_what_is_no_cloth_is_refused_by_place(skirt, body, names, save, tmp_path):
     vertices, faces = skirt
-    border = mesh.boundary_mask(faces, len(vertices))
+    border = boundary_mask(faces, len(vertices))
     a, b, _ = faces[np.flatnonzero(~border[faces].any(axis=1))[0]]
     fin = np.concatenate([vertices, vertices[[a]] + [0, 0, 0.05]])
     with pytest.raises(ValueError, match="1 edges have more than two faces, the first at"):
@@ -242,12 +242,12 @@ def test_what_does_not_go_together_is_refused(tmp_path):
         ({"template": "skirt", "vertices": 0}, "--vertices 0: 100 to 20000"),
     ):
         with pytest.raises(ValueError, match=said):
-            program.main(program.Arguments(out, **more))
+            garment.main(garment.Arguments(out, **more))
     assert not out.exists()
 
 
 def test_the_program_writes_a_garment_and_its_picture(skirt, body, save, tmp_path, capsys):
     path = save(100 * skirt[0], skirt[1])
-    program.main(program.Arguments(tmp_path / "mine.h5", mesh=path, units="cm", pin="highest"))
+    garment.main(garment.Arguments(tmp_path / "mine.h5", mesh=path, units="cm", pin="highest"))
     assert storage.load_garment(tmp_path / "mine.h5", body).pinned.sum() > 20
     assert (tmp_path / "mine.garment.png").stat().st_size > 1e4 and "openings" in capsys.readouterr().out

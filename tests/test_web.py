@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 import clothjax as cj
-from clothjax import animation, folding, skinning, storage
-from clothjax.animation import Surface
+from clothjax.body import skinning
 from clothjax.export import onnx
+from clothjax.files import storage
+from clothjax.render import ray_cast
+from clothjax.render.ray_cast import Surface
+from clothjax.runtime import specialise
 from experiments.web import build
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -84,17 +87,17 @@ def test_it_animates_fast_enough_without_an_error(page):
 @pytest.mark.parametrize("garment, motion, frame", [("skirt", "walk_3", 40), ("tshirt", "dance_3", 60)])
 def test_it_shows_what_python_shows(page, garment, motion, frame, tmp_path):
     shown, address, wrong, site = page
-    model, whole = folding.specialise(cj.load(garment)), storage.load_body("body")
+    model, whole = specialise.specialise(cj.load(garment)), storage.load_body("body")
     clip = storage.load_motion(motion, model.names)
     place = (clip.translation - clip.translation[:1] * [1, 0, 1]).astype(np.float32)
     clip = clip._replace(translation=place)
     cloth = onnx.run_onnx(site / "garments" / f"{garment}.onnx", model, clip)[frame]
     pose = cj.Pose(jnp.asarray(clip.rotations[frame], jnp.float32), jnp.asarray(place[frame]))
     skin = np.asarray(skinning.pose_body(whole, jnp.asarray(whole.vertices), jnp.asarray(whole.joints), pose))
-    camera = animation.camera_for(skin)
+    camera = ray_cast.camera_for(skin)
     faces = np.asarray(model.faces)
-    surfaces = [Surface(skin, whole.faces, animation.SKIN), Surface(cloth, faces)]
-    expected = animation.render(surfaces, camera, SIZE)
+    surfaces = [Surface(skin, whole.faces, ray_cast.SKIN), Surface(cloth, faces)]
+    expected = ray_cast.render(surfaces, camera, SIZE)
     where = ",".join(f"{x:.6f}" for x in (*camera.eye, *camera.target, camera.height))
     shown.goto(f"{address}?fast&garment={garment}&motion={motion}&frames={frame + 1}&camera={where}")
     shown.wait_for_function(f"window.clothjax && clothjax.steps === {frame + 1}", timeout=60000)

@@ -60,8 +60,12 @@ def untrained_psi(config: Config):
     import jax
     import jax.numpy as jnp
 
-    from clothjax import blendshapes, compact_latent, experiment, garment_model, latent_predictor
-    from clothjax.latent_predictor import Normalizers, Scale
+    from clothjax.networks import decoder as garment_model
+    from clothjax.networks import phi as compact_latent
+    from clothjax.networks import psi as latent_predictor
+    from clothjax.networks.normalisation import Normalizers, Scale
+    from clothjax.simulation import assembly as experiment
+    from clothjax.training import laplacian_shapes as blendshapes
 
     config = dataclasses.replace(config, motions=("walk_0",), model=dataclasses.replace(config.model, latent=9))
     whole = experiment.assemble(config)

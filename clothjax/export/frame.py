@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from clothjax import inference
-from clothjax.inference import Model, State
+from clothjax.runtime import inference
+from clothjax.runtime.inference import Model, State
 from clothjax.types import Pose
 
 ARGUMENTS = (

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax import folding, inference
 from clothjax.export import sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
-from clothjax.inference import Layer, Model
+from clothjax.runtime import inference, specialise
+from clothjax.runtime.inference import Layer, Model
 from clothjax.types import Array, Motion, Pose
 
 INPUTS = ("latent", "history", "rotations", "translation")
@@ -219,7 +219,7 @@ def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[s
 
 def canonical(g: Graph, latent: str, model: Model) -> str:
     """The garment [N, 3 V] m in the canonical pose, one coordinate after the other."""
-    limits = np.abs(folding.ordinary_weights(model)).max(axis=0) if g.int8 else None
+    limits = np.abs(specialise.ordinary_weights(model)).max(axis=0) if g.int8 else None
     template = np.asarray(model.wearer.template).reshape(-1)
     return g.even(shape_weights(g, latent, model), limits, Layer(model.network.shapes, template))
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax.folding import evening
-from clothjax.inference import Layer
+from clothjax.runtime.inference import Layer
+from clothjax.runtime.specialise import evening
 from clothjax.types import Array
 
 OPSET, IR_VERSION = 17, 8

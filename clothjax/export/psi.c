@@ -1,4 +1,4 @@
-/* See psi.h. The frame is that of clothjax/inference.py, the file that of clothjax/export/native.py. */
+/* See psi.h. The frame is that of clothjax/runtime/inference.py, the file that of clothjax/export/native.py. */
 #include "psi.h"
 
 #include <float.h>

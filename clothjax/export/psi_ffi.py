@@ -1,4 +1,4 @@
-"""`psi.c` inside of jax, on a CPU: the same step as `clothjax.inference.step`, in eight bits and plain C.
+"""`psi.c` inside of jax, on a CPU: the same step as `clothjax.runtime.inference.step`, in eight bits and plain C.
 
 XLA has no fast product of a vector and a matrix of low precision; `psi.c` has. Where there are a C and a C++ compiler,
 it is built when a model is first packed, and registered with `jax.ffi`.
@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from clothjax.export import native
-from clothjax.inference import Model, State
+from clothjax.runtime.inference import Model, State
 from clothjax.types import Array, Pose
 
 SOURCE = Path(__file__).with_name("psi_ffi.cc")

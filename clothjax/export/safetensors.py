@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import configuration
 from clothjax.config import Config
-from clothjax.inference import Bounds, Layer, Model, Network, Wearer
+from clothjax.files import configuration
+from clothjax.runtime.inference import Bounds, Layer, Model, Network, Wearer
 
 STATIC = ("names", "parents", "kept", "moving")
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax import inference
 from clothjax.export import frame, sidecar
-from clothjax.inference import Model
+from clothjax.runtime import inference
+from clothjax.runtime.inference import Model
 from clothjax.types import Motion, Pose
 
 RUN = """

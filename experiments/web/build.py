@@ -17,10 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax import animation, folding, inference, storage, trained
+from clothjax.cli import fail_clearly, setup
 from clothjax.export import onnx
+from clothjax.files import storage
+from clothjax.progress import progress_bar
+from clothjax.render import ray_cast
+from clothjax.runtime import inference, specialise, trained
 from clothjax.types import Body
-from experiments.session import fail_clearly, progress, setup
 
 HERE = Path(__file__).parent
 SOURCES = ("package.json", "package-lock.json", "main.js", "index.html")
@@ -48,9 +51,9 @@ def main(argv: list[str]) -> None:
     for name, given in (clips | {name: model.config for name, model in models.items()}).items():
         if abs(given.fps - first.config.fps) > 1e-3:
             raise ValueError(f"{name} has {given.fps} frames a second, {next(iter(models))} {first.config.fps}")
-    with progress("exporting", len(models)) as report:
+    with progress_bar("exporting", len(models)) as report:
         for index, (name, model) in enumerate(models.items()):
-            onnx.to_onnx(folding.specialise(model), arguments.out / "garments" / f"{name}.onnx", int8=True)
+            onnx.to_onnx(specialise.specialise(model), arguments.out / "garments" / f"{name}.onnx", int8=True)
             report(index + 1)
     about = body(storage.load_body(first.config.body), arguments.out / "body.bin")
     for name, clip in clips.items():
@@ -58,7 +61,7 @@ def main(argv: list[str]) -> None:
         rows = np.concatenate([np.reshape(clip.rotations, (len(place), -1)), place], axis=1)
         rows.astype("<f4").tofile(arguments.out / "motions" / f"{name}.bin")
     about |= {"garments": list(arguments.garments), "motions": list(clips), "fps": first.config.fps}
-    about |= {"skin": animation.SKIN, "cloth": animation.CLOTH}
+    about |= {"skin": ray_cast.SKIN, "cloth": ray_cast.CLOTH}
     (arguments.out / "about.json").write_text(json.dumps(about))
     bundle(arguments.out)
     print(f"written to {arguments.out}: python -m http.server --directory {arguments.out}")

@@ -1,0 +1,1 @@
+"""How good a run is: rollouts, measures against the reference solver, pictures."""

@@ -1,0 +1,70 @@
+"""Trajectories of skinning, Phi, Psi and baselines over a motion."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.body import motion_clips
+from clothjax.config import EvaluationConfig
+from clothjax.networks.animators import MakeAnimator, phi_animator
+from clothjax.runtime import inference, trained
+from clothjax.simulation import assembly, characters, rollout
+from clothjax.simulation.assembly import Experiment
+from clothjax.simulation.characters import Character
+from clothjax.types import Array, Motion, Pose
+
+SETTLING_FRAMES = 5  # frames left out of averages over time: Psi starts from a garment as skinned
+
+
+def windows(clip: Motion) -> Pose:
+    """Every window of three poses in a clip, [T - 2, 3, ...]."""
+    reel = jax.tree.map(jnp.asarray, assembly.windows(clip))
+    return jax.vmap(lambda t: motion_clips.poses(reel, t))(jnp.arange(1, len(clip.translation) - 1))
+
+
+def skinned_trajectory(whole: Experiment, character: Character, poses: Pose) -> np.ndarray:
+    """Plain skinning [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
+
+    def one(pose):
+        window = characters.window(whole.scene, character, pose)
+        return characters.skinned(character, window.current)
+
+    return np.asarray(jax.jit(lambda p: jax.lax.map(one, p))(poses))
+
+
+def states(make: MakeAnimator, model: dict, whole: Experiment, character: Character, poses: Pose) -> Array:
+    """An animator's rollout: [T, V, 3] m at the middle frame of each window, relative to its root."""
+    animator = make(model, whole.scene, character, whole.config)
+    return rollout.play(animator, whole.scene, character, poses, whole.config).states.position
+
+
+def phi_trajectory(whole: Experiment, phi: dict, character: Character, poses: Pose) -> np.ndarray:
+    """Phi in closed loop: [T - 2, V, 3] m likewise."""
+    play = jax.jit(lambda m, p: states(phi_animator, m, whole, character, p))
+    return np.asarray(play(phi, poses))
+
+
+def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
+    """Psi in closed loop: [T - 2, V, 3] m at the same frames, relative to the root."""
+    part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
+    origin = part.translation[:1]
+    local = part._replace(translation=(part.translation - origin).astype(np.float32), rotations=part.rotations)
+    vertices, _ = inference.animate(psi, local)
+    return np.asarray(vertices) - np.asarray(local.translation)[:, None]
+
+
+def load_run(
+    directory: Path, evaluation: EvaluationConfig | None = None, read: Callable = trained.phi
+) -> tuple[assembly.Experiment, dict]:
+    """Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`.
+
+    Args:
+        evaluation: in the place of what the run was trained with.
+        read: `trained.network` takes a peer's network too.
+    """
+    config, model = read(directory)
+    return assembly.assemble(dataclasses.replace(config, evaluation=evaluation or config.evaluation)), model

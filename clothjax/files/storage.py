@@ -1,0 +1,418 @@
+"""Bodies, garments and motions as HDF5 files: one schema, checked when a file is opened.
+
+Lengths are metres, +Y is up. Every file has the attributes `format` (below), `version` 1, `name`,
+`units` "m", `up` "+Y", `licence` and `source`. Floats are float32 unless said otherwise.
+
+Body, `format` "clothjax/body":
+    vertices [B, 3]; faces [Fb, 3] int32; joints [J, 3]; joint_names [J] strings;
+    parents [J] int32, the root first with -1, parents before their children;
+    weights_index [B, n] int16 and weights_value [B, n]: skinning weights, each row summing to 1;
+    shapedirs [B, 3, S] and joint_shapedirs [J, 3, S], per standard deviation;
+    optional posedirs [B, 3, 9 (J - 1)];
+    optional canonical_rotation [J, 3, 3], which turns each bone of the canonical pose to a T-pose.
+Garment, `format` "clothjax/garment", attribute `body`, the name of the body it is aligned with:
+    vertices [V, 3]; faces [F, 3] int32; weights_index [V, n] int16 and weights_value [V, n];
+    shapedirs [V, 3, S]; pin [V] bool, the vertices that follow skinning;
+    optional cloth [V, 3]: how many times the material's density, its mu and lam, and its bending the cloth has there.
+Motion, `format` "clothjax/motion", attribute `fps` float64:
+    poses [T, J, 3], axis-angle in radians, local to the parent; zero is the body's canonical pose;
+    trans [T, 3] float64, of the root relative to its canonical place; joint_names [J] strings.
+
+On reading, any `format` that ends in /body, /garment or /motion will do, and further datasets are left alone.
+"""
+
+import os
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from clothjax.types import Body, Garment, Motion
+
+VERSION = 1
+# what readers of files raise where these are damaged or of another kind
+UNREADABLE = (
+    ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, RuntimeError, ArithmeticError, MemoryError,
+    SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+ASSETS = Path(__file__).parents[1] / "assets"
+FACTORS = (0.01, 100.0)  # of a region's cloth over the garment's
+
+
+# Names
+
+
+def asset(name: str | Path) -> Path:
+    """The file meant by a configuration: a path as it is, or a name of something embedded, as "tshirt_1000".
+
+    Raises:
+        ValueError: for a name that is neither.
+    """
+    path = Path(name)
+    if path.suffix or len(path.parts) > 1:
+        return path
+    for folder in (ASSETS, ASSETS / "motions"):
+        if (folder / f"{name}.h5").is_file():
+            return folder / f"{name}.h5"
+    known = ", ".join(n for kind in ("body", "garment", "motion") for n in asset_names(kind))
+    raise ValueError(f"nothing embedded is called {str(name)!r}: give the path of a file (.h5), or one of {known}")
+
+
+def asset_names(kind: str) -> tuple[str, ...]:
+    """Names of everything embedded of a kind: "body", "garment" or "motion", in alphabetical order."""
+    files = sorted((ASSETS / "motions" if kind == "motion" else ASSETS).glob("*.h5"))
+    names = tuple(file.stem for file in files)
+    return names if kind == "motion" else tuple(n for n in names if (n == "body") == (kind == "body"))
+
+
+# Reading
+
+
+def load_body(path: str | Path) -> Body:
+    """The body in a file (or embedded), with dense skinning weights [B, J] float32.
+
+    Raises:
+        ValueError: naming the file, the dataset and the first wrong entry.
+    """
+    with _open(path, "body") as file:
+        sizes: dict[str, int] = {}
+        vertices = _floats(file, "vertices", ("B", 3), sizes)
+        joints = _floats(file, "joints", ("J", 3), sizes)
+        parents = _integers(file, "parents", ("J",), sizes, -1, sizes["J"])
+        _check_parents(file, parents)
+        _check_size(file, "body height", np.ptp(vertices[:, 1]), 0.3, 3.0)
+        body = Body(
+            vertices=vertices,
+            faces=_faces(file, ("Fb", 3), sizes, sizes["B"]),
+            joints=joints,
+            parents=parents,
+            weights=_weights(file, "B", sizes),
+            shapedirs=_floats(file, "shapedirs", ("B", 3, "S"), sizes),
+            joint_shapedirs=_floats(file, "joint_shapedirs", ("J", 3, "S"), sizes),
+        )
+        if "posedirs" in file:
+            shape = ("B", 3, 9 * (sizes["J"] - 1))
+            body = body._replace(posedirs=_floats(file, "posedirs", shape, sizes))
+        _names(file, sizes)
+        return body
+
+
+def load_garment(path: str | Path, body: Body) -> Garment:
+    """The garment in a file (or embedded), made for `body`.
+
+    Raises:
+        ValueError: naming the file, the dataset and the first wrong entry; or if the body is far away.
+    """
+    with _open(path, "garment") as file:
+        sizes = {"J": len(body.parents), "S": np.shape(body.shapedirs)[-1]}
+        vertices = _floats(file, "vertices", ("V", 3), sizes)
+        _check_size(file, "largest extent of the garment", np.ptp(vertices, axis=0).max(), 0.05, 3.0)
+        distance = np.median(cKDTree(np.asarray(body.vertices)).query(vertices)[0])
+        if distance > 0.3:
+            raise ValueError(
+                f"{file.filename}: half of the garment is more than {distance:.2f} m from the body: "
+                "it was made for another body or another origin; align the two"
+            )
+        faces = _faces(file, ("F", 3), sizes, sizes["V"])
+        _check_sides(file, faces)
+        loose = np.setdiff1d(np.arange(sizes["V"]), faces)
+        if len(loose):
+            raise ValueError(f"{file.filename}: vertex {loose[0]} has no face ({len(loose)} such): remove it")
+        return Garment(
+            vertices=vertices,
+            faces=faces,
+            weights=_weights(file, "V", sizes),
+            shapedirs=_floats(file, "shapedirs", ("V", 3, "S"), sizes),
+            pinned=_dataset(file, "pin", ("V",), sizes).astype(bool),
+            cloth=_cloth(file, sizes) if "cloth" in file else None,
+        )
+
+
+def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> Motion:
+    """The clip in a file (or embedded): rotations float32, translation float64.
+
+    Args:
+        path: of the file.
+        joint_names: the body's, from `joint_names(body_path)`; the motion must have the same, in that order.
+
+    Raises:
+        ValueError: naming the file, the dataset and the first wrong entry.
+    """
+    with _open(path, "motion") as file:
+        sizes: dict[str, int] = {}
+        poses = _floats(file, "poses", ("T", "J", 3), sizes).astype(np.float64)
+        translation = _floats(file, "trans", ("T", 3), sizes, np.float64)
+        fps = file.attrs.get("fps")
+        if not isinstance(fps, (int, float, np.number)) or not 0 < fps < np.inf:
+            raise ValueError(f"{file.filename}: attribute 'fps' must be a number > 0, got {fps!r}")
+        if np.median(np.abs(translation[:, 1])) > 20:
+            height = np.median(np.abs(translation[:, 1]))
+            raise ValueError(f"{file.filename}: root height {height:.0f} m looks like centimetres: divide by 100")
+        names = _names(file, sizes)
+        if joint_names is not None and names != tuple(joint_names):
+            _refuse_joints(file, names, tuple(joint_names))
+        rotations = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+        return Motion(rotations.astype(np.float32), translation, float(fps))
+
+
+def joint_names(path: str | Path) -> tuple[str, ...]:
+    """Joint names of a body or motion file (or embedded)."""
+    with _open(path, "") as file:
+        return _names(file, {})
+
+
+def canonical_rotation(path: str | Path) -> np.ndarray:
+    """Rotations [J, 3, 3] of a body's bones from its canonical pose to a T-pose; identity if not stored."""
+    with _open(path, "body") as file:
+        names = _names(file, {})
+        if "canonical_rotation" not in file:
+            return np.tile(np.eye(3), (len(names), 1, 1))
+        return _floats(file, "canonical_rotation", (len(names), 3, 3), {}, np.float64)
+
+
+# Writing
+
+
+def save_body(
+    path: str | Path,
+    body: Body,
+    joint_names: Sequence[str],
+    *,
+    name: str,
+    source: str,
+    licence: str,
+    canonical_rotation: np.ndarray | None = None,
+) -> None:
+    """Writes a body, whole or not at all."""
+    data = {
+        "vertices": np.float32(body.vertices),
+        "faces": np.int32(body.faces),
+        "joints": np.float32(body.joints),
+        "parents": np.int32(body.parents),
+        "joint_names": _strings(joint_names),
+        **_sparse(body.weights),
+        "shapedirs": np.float32(body.shapedirs),
+        "joint_shapedirs": np.float32(body.joint_shapedirs),
+    }
+    if body.posedirs is not None:
+        data["posedirs"] = np.float32(body.posedirs)
+    if canonical_rotation is not None:
+        data["canonical_rotation"] = np.float32(canonical_rotation)
+    _write(path, "body", data, name=name, source=source, licence=licence)
+
+
+def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str) -> None:
+    """Writes a garment, whole or not at all; `body` names the body it was made for."""
+    data = {
+        "vertices": np.float32(garment.vertices),
+        "faces": np.int32(garment.faces),
+        **_sparse(garment.weights),
+        "shapedirs": np.float32(garment.shapedirs),
+        "pin": np.asarray(garment.pinned, bool),
+    }
+    if garment.cloth is not None:
+        data["cloth"] = np.float32(garment.cloth)
+    _write(path, "garment", data, name=name, body=body, source=source, licence=licence)
+
+
+def save_motion(
+    path: str | Path, motion: Motion, joint_names: Sequence[str], *, name: str, source: str, licence: str
+) -> None:
+    """Writes a clip, whole or not at all."""
+    rotations = np.asarray(motion.rotations, np.float64)
+    poses = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(rotations.shape[:3])
+    data = {
+        "poses": np.float32(poses),
+        "trans": np.float64(motion.translation),
+        "joint_names": _strings(joint_names),
+    }
+    _write(path, "motion", data, fps=float(motion.fps), name=name, source=source, licence=licence)
+
+
+# One dataset at a time
+
+
+@contextmanager
+def _open(path: str | Path, kind: str) -> Iterator[h5py.File]:
+    path = asset(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            form = str(_decoded(file.attrs.get("format", "missing")))
+            if kind and form.rpartition("/")[2] != kind:
+                raise ValueError(f"{path}: attribute 'format' is {form!r}, expected 'clothjax/{kind}'")
+            for key, wanted in (("version", VERSION), ("units", "m"), ("up", "+Y")):
+                found = _decoded(file.attrs.get(key, wanted))
+                if found != wanted:
+                    raise ValueError(f"{path}: attribute {key!r} is {found!r}, expected {wanted!r}")
+            yield file
+    except (OSError, RuntimeError, KeyError) as error:  # what h5py raises for a damaged file
+        raise ValueError(f"{path}: not a readable HDF5 file, perhaps cut short ({error})") from error
+
+
+def _dataset(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int]) -> np.ndarray:
+    """A dataset of a shape given by numbers and letters; a letter new to `sizes` takes the size found."""
+    if name not in file:
+        raise ValueError(f"{file.filename}: dataset {name!r} is missing; it has {', '.join(sorted(map(str, file)))}")
+    found = file[name].shape
+    wanted = tuple(sizes.get(n, n) for n in shape)
+    if found[:1] == (0,):
+        what = {"T": "frames", "J": "joints"}.get(shape[0], "rows")
+        raise ValueError(f"{file.filename}: dataset {name!r} is empty, there are no {what} in it")
+    if len(found) != len(wanted) or any(isinstance(w, int) and w != f for f, w in zip(found, wanted)):
+        text = ", ".join(f"{n} = {sizes[n]}" if n in sizes else str(n) for n in shape)
+        raise ValueError(f"{file.filename}: dataset {name!r} has shape {found}, expected ({text})")
+    sizes.update({n: f for n, f in zip(shape, found) if isinstance(n, str)})
+    return file[name][()]
+
+
+def _floats(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], dtype: type = np.float32) -> np.ndarray:
+    value = _dataset(file, name, shape, sizes)
+    if value.dtype.kind not in "fiu":
+        raise ValueError(f"{file.filename}: dataset {name!r} must hold numbers, got {value.dtype}")
+    wrong = np.argwhere(~np.isfinite(value))
+    if len(wrong):
+        where = tuple(int(i) for i in wrong[0])
+        raise ValueError(
+            f"{file.filename}: dataset {name!r} is {value[where]} at {where}"
+            f" ({len(wrong)} such values): all must be finite"
+        )
+    return value.astype(dtype)
+
+
+def _integers(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], low: int, high: int) -> np.ndarray:
+    value = _dataset(file, name, shape, sizes)
+    if value.dtype.kind not in "iu":
+        raise ValueError(f"{file.filename}: dataset {name!r} must hold integers, got {value.dtype}")
+    wrong = np.argwhere((value < low) | (value >= high))
+    if len(wrong):
+        where = tuple(int(i) for i in wrong[0])
+        raise ValueError(f"{file.filename}: dataset {name!r} is {value[where]} at {where}, allowed {low} to {high - 1}")
+    return value.astype(np.int32)
+
+
+def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) -> np.ndarray:
+    faces = _integers(file, "faces", shape, sizes, 0, vertices)
+    a, b, c = faces.T
+    twice = np.flatnonzero((a == b) | (b == c) | (c == a))
+    if len(twice):
+        raise ValueError(f"{file.filename}: face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it")
+    return faces
+
+
+def _check_sides(file: h5py.File, faces: np.ndarray) -> None:
+    """Refuses what is no cloth with two sides."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    for rows, allowed in ((np.sort(ends, axis=1), 2), (ends, 1)):
+        _, first, times = np.unique(rows, axis=0, return_index=True, return_counts=True)
+        if times.max(initial=0) > allowed:
+            a, b = rows[first[times.argmax()]].tolist()
+            around = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1)).tolist()
+            if allowed == 2:
+                what = f"the edge of vertices {a} and {b} has {len(around)} faces, not two: separate the layers"
+            else:
+                what = f"faces {around[0]} and {around[1]} are wound opposite ways: turn one"
+            raise ValueError(f"{file.filename}: {what}; `python -m data_prep.garment --mesh` checks and orients a mesh")
+
+
+def _weights(file: h5py.File, letter: str, sizes: dict[str, int]) -> np.ndarray:
+    index = _integers(file, "weights_index", (letter, "n"), sizes, 0, sizes["J"])
+    value = _floats(file, "weights_value", (letter, "n"), sizes)
+    wrong = np.flatnonzero((np.abs(value.sum(axis=1) - 1) > 1e-3) | (value.min(axis=1, initial=0) < 0))
+    if len(wrong):
+        raise ValueError(
+            f"{file.filename}: dataset 'weights_value', row {wrong[0]} is {value[wrong[0]].tolist()}:"
+            " weights must be >= 0 and sum to 1"
+        )
+    dense = np.zeros((len(index), sizes["J"]), np.float32)
+    np.add.at(dense, (np.arange(len(index))[:, None], index), value)
+    return dense / dense.sum(axis=1, keepdims=True)
+
+
+def _cloth(file: h5py.File, sizes: dict[str, int]) -> np.ndarray:
+    factors = _floats(file, "cloth", ("V", 3), sizes)
+    low, high = FACTORS
+    wrong = np.argwhere((factors < low) | (factors > high))
+    if len(wrong):
+        where = tuple(int(i) for i in wrong[0])
+        raise ValueError(
+            f"{file.filename}: dataset 'cloth' is {factors[where]:g} at {where}: a factor from {low} to {high}"
+        )
+    return factors
+
+
+def _sparse(weights: np.ndarray) -> dict[str, np.ndarray]:
+    weights = np.asarray(weights)
+    kept = max(int((weights > 0).sum(axis=1).max()), 1)
+    index = np.argsort(-weights, axis=1, kind="stable")[:, :kept]
+    value = np.take_along_axis(weights, index, axis=1)
+    return {"weights_index": np.int16(index), "weights_value": np.float32(value)}
+
+
+def _names(file: h5py.File, sizes: dict[str, int]) -> tuple[str, ...]:
+    names = _dataset(file, "joint_names", ("J",), sizes)
+    return tuple(str(_decoded(n)) for n in names)
+
+
+def _decoded(value: object) -> object:
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
+def _strings(values: Sequence[str]) -> np.ndarray:
+    """Of one length, so that they stand in the dataset itself; HDF5 keeps others in a heap that no sum checks."""
+    encoded = [value.encode() for value in values]
+    return np.array(encoded, h5py.string_dtype("utf-8", max(map(len, encoded), default=0) or 1))
+
+
+def _check_parents(file: h5py.File, parents: np.ndarray) -> None:
+    order = np.arange(len(parents))
+    wrong = np.flatnonzero((parents >= order) | ((parents < 0) != (order == 0)))
+    if len(parents) == 0 or len(wrong):
+        first = int(wrong[0]) if len(wrong) else 0
+        raise ValueError(
+            f"{file.filename}: dataset 'parents' is {parents[first : first + 1].tolist()} at joint {first}:"
+            " the first joint must have -1, every other one a joint before it"
+        )
+
+
+def _check_size(file: h5py.File, what: str, size: float, low: float, high: float) -> None:
+    if low <= size <= high:
+        return
+    for unit, factor in (("centimetres", 100), ("millimetres", 1000)):
+        if low <= size / factor <= high:
+            raise ValueError(f"{file.filename}: {what} {size:g} m looks like {unit}: divide lengths by {factor}")
+    raise ValueError(f"{file.filename}: {what} is {size:g} m, allowed {low} to {high}")
+
+
+def _refuse_joints(file: h5py.File, found: tuple[str, ...], wanted: tuple[str, ...]) -> None:
+    lacking = [n for n in wanted if n not in found]
+    further = [n for n in found if n not in wanted]
+    text = f"lacks {lacking}, has {further} besides" if lacking or further else f"has another order, {list(found)}"
+    raise ValueError(f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)")
+
+
+def _write(path: str | Path, kind: str, data: dict[str, np.ndarray], **attributes) -> None:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        # of this version all of a file is checked by sums: libhdf5 can crash where what describes the data is damaged
+        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
+            fixed = {"format": f"clothjax/{kind}", "version": VERSION, "units": "m", "up": "+Y"}
+            for key, value in {**fixed, **attributes}.items():
+                file.attrs[key] = _strings([value])[0] if isinstance(value, str) else value
+            for key, value in data.items():
+                options = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": True}
+                file.create_dataset(key, data=value, **options)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Triangle meshes: connectivity, coarser levels, what is nearest. Knows no cloth."""

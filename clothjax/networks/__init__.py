@@ -1,0 +1,1 @@
+"""Phi, Psi, their parts and the baselines: init and apply, no training."""

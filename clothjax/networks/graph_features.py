@@ -1,0 +1,200 @@
+"""Node and edge features of Phi, in the root's heading frame, and their running normalisation.
+
+Nothing here changes when the scene is moved, or turned about the vertical.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from clothjax.body import skinning
+from clothjax.config import MaterialConfig, ModelConfig
+from clothjax.material import material_inputs
+from clothjax.physics import contact_search, energies
+from clothjax.simulation.characters import Character, Window
+from clothjax.simulation.scene import Scene
+from clothjax.types import Array, ClothState, Contact
+
+
+class WorldFeatures(NamedTuple):
+    """Of the body: nodes, and pairs of a garment vertex with the body vertex nearest to it."""
+
+    nodes: Array  # [S, N], a slot for every body vertex that may be nearest to some garment vertex
+    slots: Array  # [V] int32, the slot of each garment vertex
+    active: Array  # [V] bool, whether the pair is close enough to count
+    to_garment: Array  # [V, W]
+    to_body: Array  # [V, W] the same pair in the other direction
+
+
+class Features(NamedTuple):
+    """Raw inputs of the encoders."""
+
+    nodes: Array  # [V, N]
+    edges: dict[str, Array]  # [E, M] by edge set
+    world: WorldFeatures | None  # None where there is no body
+
+
+def compute(
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    window: Window,
+    contact: Contact | None,
+    timestep: Array,
+    held: Array,
+    force: Array,
+    model: ModelConfig,
+    material: MaterialConfig,
+) -> Features:
+    """The inputs of Phi for one step: HOOD's, plus positions and accelerations (method: X_H+).
+
+    Args:
+        contact: planes at the body points nearest to the garment now; None where there is no body.
+        timestep: s.
+        held: [V, 3] m, the next positions if the canonical displacement were kept.
+        force: [V, 3] N on the garment there, minus the potential's gradient.
+    """
+    turn = window.current.heading.T
+    inputs = material_inputs(character.material, material)
+
+    def node(velocity, acceleration, normal, position, log_mass, materials):
+        shared = [velocity, acceleration, normal, position - window.current.root[None]]
+        columns = [_rotate(turn, part) for part in shared]
+        count = len(position)
+        materials = jnp.broadcast_to(materials[None], (count, *materials.shape))
+        return jnp.concatenate([*columns, _column(jnp.asarray(timestep), count), log_mass[:, None], materials], axis=-1)
+
+    garment = node(
+        state.velocity,
+        state.acceleration,
+        skinning.vertex_normals(state.position, scene.garment.faces),
+        state.position,
+        jnp.log(character.mass),
+        inputs,
+    )
+    edge_points = {"now": state.position}
+    extra = jnp.zeros((len(garment), 0), garment.dtype)
+    if model.canonical_features:
+        extra, drifted = _canonical(character, state, window, contact, held, force)
+        edge_points |= {"held": held, "drifted": drifted}
+    edges = {
+        name: mesh_edges(senders, receivers, edge_points, character.template, turn, timestep, inputs)
+        for name, (senders, receivers) in scene.graph.items()
+    }
+    world = None
+    if contact is not None:
+        world = _world(state, window, contact, timestep, node, inputs, extra.shape[-1], model.body_radius)
+    return Features(jnp.concatenate([garment, extra], axis=-1), edges, world)
+
+
+def _world(
+    state: ClothState, window: Window, contact: Contact, timestep: Array, node, inputs: Array, extra: int, radius: float
+) -> WorldFeatures:
+    """Of the body, as the garment's: `node` makes rows, which get `extra` columns of zeros."""
+    bodies = [frame.body for frame in window]
+    before, now, following = bodies
+    normals, nearest, slots = window.current.normals, contact.index, contact.index
+    if len(now) > len(nearest):  # the distinct ones, in slots
+        vertices, slots = jnp.unique(nearest, size=len(nearest), fill_value=0, return_inverse=True)
+        slots = slots.astype(jnp.int32).reshape(-1)
+        before, now, following, normals = (x[vertices] for x in (before, now, following, normals))
+    nodes = node(
+        now - before, following - 2 * now + before, normals, now, -jnp.ones_like(now[:, 0]), -jnp.ones_like(inputs)
+    )
+    offset_now = state.position - bodies[1][nearest]
+    offset_next = state.position - bodies[2][nearest]
+    turn = window.current.heading.T
+    to_body, to_garment = world_edges(offset_now, offset_next, turn, timestep)
+    return WorldFeatures(
+        nodes=jnp.pad(nodes, ((0, 0), (0, extra))),
+        slots=slots,
+        active=jnp.sum(offset_now * offset_now, axis=-1) <= radius**2,
+        to_garment=to_garment,
+        to_body=to_body,
+    )
+
+
+def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
+    """Features [V, 9] of the pairs of garment and body vertices, towards the body and towards the garment.
+
+    Args:
+        offset_now, offset_next: [V, 3] m from the body vertex, at this frame and at the next, to the garment vertex.
+    """
+
+    def one(sign):
+        parts = [
+            _rotate(turn, sign * offset_now), _length(offset_now), _rotate(turn, sign * offset_next),
+            _length(offset_next), _column(jnp.asarray(timestep), len(offset_now)),
+        ]  # fmt: skip
+        return jnp.concatenate(parts, axis=-1)
+
+    return one(1.0), one(-1.0)
+
+
+def _canonical(
+    character: Character, state: ClothState, window: Window, contact: Contact | None, held: Array, force: Array
+):
+    """The state as the next frame's canonical pose sees it, [V, 22], or [V, 15] without a body; and where it would be
+    if nothing pushed.
+
+    `held` keeps the canonical displacement, `drifted` keeps the velocity: the two guesses between which, roughly,
+    the next position lies. Contact is measured from both; the force at `held` says where to go from there, over the
+    weight of the vertex and compressed, since it spans five decades.
+    """
+    following = window.following.garment
+    displacement = skinning.unapply(window.current.garment, state.position) - character.template
+    drifted = state.position + state.velocity
+    down = jnp.zeros_like(drifted).at[:, 1].set(-1.0)
+    pull = force / (energies.GRAVITY * character.mass[:, None])
+    size = _length(pull)
+    pull = pull * jnp.where(size > 1e-6, jnp.arcsinh(size) / jnp.maximum(size, 1e-6), 1.0)
+    columns = [
+        displacement,
+        skinning.unapply_direction(following, pull),
+        skinning.unapply(following, drifted) - character.template,
+        skinning.unapply_direction(following, down),
+    ]
+    if contact is not None:
+        columns.append(skinning.unapply_direction(following, contact.normal_next))
+    columns.append(character.template)
+    if contact is not None:
+        gaps = [contact_search.distance(x, contact.point_next, contact.normal_next)[:, None] for x in (held, drifted)]
+        columns += [jnp.clip(gap, -0.05, 0.05) for gap in gaps]
+        columns += [jnp.maximum(0.003 - gap, 0.0) for gap in gaps]
+    return jnp.concatenate(columns, axis=-1), drifted
+
+
+def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
+    """Features of edges: relative positions now and at rest, [E, 12]; and the strain of each guess of the next state.
+
+    Args:
+        points: [V, 3] m by name: `now`, and the guesses `held` and `drifted` where there are any.
+        template: [V, 3] m, at rest; turn: [3, 3] into the frame of the features; inputs: [3] the material, or [0].
+    """
+    rest = template[senders] - template[receivers]
+    rest_length = _length(rest)
+    now = points["now"][senders] - points["now"][receivers]
+    columns = [_rotate(turn, now), _length(now), rest, rest_length]
+    for name in ("held", "drifted"):
+        if name in points:
+            vector = points[name][senders] - points[name][receivers]
+            columns += [_length(vector) / rest_length - 1.0]
+    columns += [
+        _column(jnp.asarray(timestep), len(senders)),
+        jnp.broadcast_to(inputs[None], (len(senders), *inputs.shape)),
+    ]
+    return jnp.concatenate(columns, axis=-1)
+
+
+def _rotate(turn: Array, vectors: Array) -> Array:
+    return jnp.einsum("ab,nb->na", turn, vectors, precision="highest")
+
+
+def _length(vectors: Array) -> Array:
+    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
+    zero = squared == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def _column(scalar: Array, count: int) -> Array:
+    return jnp.broadcast_to(scalar.reshape(1, 1), (count, 1))

@@ -1,0 +1,110 @@
+"""Running statistics of features; scales and bounds of codes and poses."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.types import Array
+
+
+class Statistics(NamedTuple):
+    """Running mean and variance of a set of feature columns."""
+
+    mean: Array  # [N]
+    variance: Array  # [N]
+    count: Array  # rows seen
+
+
+# --- normalisation ------------------------------------------------------------------------------------------------
+
+
+def empty_statistics(columns: int) -> Statistics:
+    """Statistics of nothing yet: they leave features as they are."""
+    return Statistics(jnp.zeros(columns), jnp.ones(columns), jnp.zeros(()))
+
+
+def observe(statistics: Statistics, rows: Array, counted: Array | None = None) -> Statistics:
+    """Statistics that have also seen `rows` [N, columns], or those of them that are `counted` [N] bool.
+
+    Chan's update of mean and variance: E[x^2] - E[x]^2 would lose constant columns to rounding.
+    """
+    weight = jnp.ones_like(rows[:, :1]) if counted is None else counted[:, None].astype(rows.dtype)
+    rows = jnp.where(weight > 0, rows, 0.0)
+    new = jnp.maximum(jnp.sum(weight), 1.0)
+    mean = jnp.sum(weight * rows, axis=0) / new
+    variance = jnp.sum(weight * jnp.square(rows - mean[None]), axis=0) / new
+    count = statistics.count + jnp.sum(weight)
+    share = jnp.sum(weight) / jnp.maximum(count, 1.0)
+    shift = mean - statistics.mean
+    return Statistics(
+        mean=statistics.mean + share * shift,
+        variance=(1.0 - share) * statistics.variance + share * variance + share * (1.0 - share) * shift * shift,
+        count=count,
+    )
+
+
+def standardise(statistics: Statistics, rows: Array, bound: float = 10.0, least: float = 1e-6) -> Array:
+    """Features [N, columns] by mean and standard deviation, at least `least`, clipped to `bound` deviations."""
+    deviation = jnp.sqrt(jnp.maximum(statistics.variance, least**2))
+    return jnp.clip((rows - statistics.mean[None]) / deviation[None], -bound, bound)
+
+
+# what may be out of its range without being worth a word
+SLACK = 0.02  # of an input: m/s, m or of a rotation matrix
+CODE_SLACK = 0.1  # of a code or a constant, as they are normalised
+
+
+class Scale(NamedTuple):
+    """How rows [N] are made comparable, and the range that is ordinary for them."""
+
+    mean: Array  # [N]
+    deviation: Array  # [N]
+    low: Array  # [N] the least and ...
+    high: Array  # [N] ... the greatest seen, in standard deviations from the mean
+
+
+class Normalizers(NamedTuple):
+    """Scales of the predictor's inputs and outputs."""
+
+    latent: Scale  # [L]
+    pose: Scale  # [P]
+
+
+def identity(size: int) -> Scale:
+    """The scale that leaves rows [N] as they are, whatever is in them."""
+    far = np.full(size, 1e6, np.float32)
+    return Scale(np.zeros(size, np.float32), np.ones(size, np.float32), -far, far)
+
+
+def normalise(scale: Scale, row: Array) -> Array:
+    """A row [N] in standard deviations from the mean."""
+    return (row - scale.mean) / scale.deviation
+
+
+def denormalise(scale: Scale, row: Array) -> Array:
+    """The inverse of `normalise`."""
+    return row * scale.deviation + scale.mean
+
+
+def bounded(row: Array, low: Array, high: Array, slack: Array | float = CODE_SLACK) -> tuple[Array, Array]:
+    """A row [N] brought into the range [low, high], NaN to its middle, and whether it was there but for `slack`."""
+    inside = jnp.where(jnp.isnan(row), 0.5 * (low + high), jnp.clip(row, low, high))
+    return inside, jnp.all(jnp.abs(inside - row) <= slack)
+
+
+def widened(scale: Scale, rows: np.ndarray) -> Scale:
+    """The same scale, with rows [n, N] within its range."""
+    rows = np.asarray(normalise(jax.tree.map(np.asarray, scale), rows))
+    return scale._replace(low=np.minimum(scale.low, rows.min(0)), high=np.maximum(scale.high, rows.max(0)))
+
+
+def measure(rows: np.ndarray) -> Scale:
+    """The scale of rows [n, N]."""
+    rows = np.asarray(rows, np.float64)
+    mean, deviation = rows.mean(0), rows.std(0)
+    # a column that never changed in training is left alone, not blown up
+    deviation = np.where(deviation > 1e-6, deviation, 1.0)
+    low, high = (rows.min(0) - mean) / deviation, (rows.max(0) - mean) / deviation
+    return Scale(*(jnp.asarray(x, jnp.float32) for x in (mean, deviation, low, high)))

@@ -1,0 +1,187 @@
+"""What each vertex and each edge of a garment may touch during a time step: planes, found once and kept."""
+
+import jax
+import jax.numpy as jnp
+
+from clothjax.geometry.proximity import (
+    Patches,
+    closest_on_triangle,
+    nearest_face,
+    nearest_face_around,
+    nearest_point,
+    winding_number,
+)
+from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
+
+ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
+DEEP = 0.7  # of a triangle's size, the root of its area: farther in than this the winding number has to agree
+WOUND = 0.25  # the least of it that does: it is 0 outside, 1 inside, and half of that behind an open sheet
+LEVEL = 1e-4  # m, planes that differ by less are one
+
+
+def find(positions: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None = None) -> Contact:
+    """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
+
+    The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
+    2005). Skinning turns skin inside out in bent hips and knees, and pushes it through to the other side: these then
+    say of what is centimetres in front of a body that it is in it. So inside and deep, by the size of the triangle, is
+    only what the body also winds around. Where the body ends, as where it was cut, the surface is taken to go on as far
+    as that. Plane and point go with their triangle to the next frame. A foot that passes by takes its planes along,
+    through what it will not touch: one that is deep in where the body then does not wind around it, stays behind.
+
+    Args:
+        body, body_next: [B, 3] m at this frame and the next.
+        ahead: [V, 3] m, where the positions are expected at the next frame; None to leave out the last.
+    """
+    positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
+    face = nearest_face(positions, body[patches.faces], patches.groups)
+    return _planes(positions, face, body, body_next, patches, ahead)
+
+
+def _planes(
+    positions: Array, face: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None
+) -> Contact:
+    """As `find`, with the nearest triangles [V] known."""
+    faces, corners = patches.faces, body[patches.faces]
+    here, there = corners[face], body_next[faces[face]]
+    weights, _ = jax.lax.stop_gradient(closest_on_triangle(positions, here))
+    point, point_next = (jnp.einsum("vk,vkc->vc", weights, x, precision="highest") for x in (here, there))
+
+    offset = positions - point
+    apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
+    pseudonormal, border = jax.lax.stop_gradient(_pseudonormal(body, corners, patches, face, weights))
+    inside = jnp.sum(offset * pseudonormal, axis=-1, keepdims=True) < 0
+    deep = apart > DEEP**2 * jax.lax.stop_gradient(_areas(here))[:, None]
+    doubtful = inside & deep
+    inside &= ~doubtful | (winding_number(positions, corners, patches.groups, doubtful[:, 0])[:, None] > WOUND)
+    side = jnp.where(inside, -1.0, 1.0)
+    on_surface = (apart < ON_SURFACE**2) | (border[:, None] & ~deep)
+    normal = jnp.where(on_surface, pseudonormal, side * offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
+    local = jnp.einsum("vca,vc->va", _axes(here), normal, precision="highest")
+    turned = jnp.einsum("vca,va->vc", _axes(there), local, precision="highest")
+    lost = jnp.sum(turned * turned, axis=-1, keepdims=True) < 0.99  # a triangle without area has no axes
+    turned = jnp.where(lost, normal, turned)
+    if ahead is not None:
+        gap = jax.lax.stop_gradient(distance(ahead, point_next, turned))
+        doubtful = gap < -DEEP * jnp.sqrt(jax.lax.stop_gradient(_areas(there)))
+        passed = doubtful & (winding_number(ahead, body_next[faces], patches.groups, doubtful) <= WOUND)
+        back = gap - jnp.maximum(jax.lax.stop_gradient(distance(positions, point, normal)), 0.0)
+        point_next += jnp.where(passed, back, 0.0)[:, None] * turned
+    return Contact(point, point_next, normal, turned, faces[face, jnp.argmax(weights, axis=1)])
+
+
+def find_at_edges(
+    positions: Array,
+    planes: Contact,
+    mesh: Mesh,
+    body: Array,
+    body_next: Array,
+    patches: Patches,
+    ahead: Array | None = None,
+) -> EdgeContact:
+    """The contact of each edge where it comes nearest to the body between its ends, whose planes are `planes`.
+
+    That place is where the planes of both ends are equally far: over a body's edge, which has one of the ends on
+    either side, the point of the garment's edge above it; over a flat part the middle. What is nearest to it is sought
+    near what is nearest to the ends.
+
+    Args:
+        positions, ahead: [V, 3] m, as of `find`, whose `planes` [V, ...] are those of the vertices.
+        body, body_next: [B, 3] m at this frame and the next.
+    """
+    positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
+    a, b = mesh.edges[:, 0], mesh.edges[:, 1]
+    start, end = positions[a], positions[b]
+
+    def beyond(position, own, other):
+        # how much farther an end is from its own plane than from that of the other end
+        mine, its = (distance(position, planes.point[i], planes.normal[i]) for i in (own, other))
+        return jnp.maximum(mine - its, 0.0) + LEVEL
+
+    before, after = beyond(start, a, b), beyond(end, b, a)
+    place = jax.lax.stop_gradient(before / (before + after))
+
+    def between(x):
+        return x[a] + place[:, None] * (x[b] - x[a])
+
+    face = nearest_face_around(between(positions), body, patches, [planes.index[end] for end in (a, b)])
+    later = None if ahead is None else between(ahead)
+    found = _planes(between(positions), face, body, body_next, patches, later)
+    return EdgeContact(place, found.point_next, found.normal_next)
+
+
+def find_on_self(positions: Array, patches: Patches) -> SelfContact:
+    """The nearest point of the garment [V, 3] m to each of its vertices, on triangles that it is no corner of."""
+    positions, patches = jax.tree.map(jnp.asarray, (positions, patches))
+    corners = positions[patches.faces]
+    face = nearest_face(positions, corners, patches.groups, patches.faces)
+    here = corners[face]
+    weights, _ = jax.lax.stop_gradient(closest_on_triangle(positions, here))
+    offset = positions - jnp.einsum("vk,vkc->vc", weights, here, precision="highest")
+    apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
+    on_surface = apart < ON_SURFACE**2
+    across = _unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
+    normal = jnp.where(on_surface, across, offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
+    return SelfContact(patches.faces[face], weights, jax.lax.stop_gradient(normal))
+
+
+def find_at_centroids(positions: Array, body: Array, body_next: Array, faces: Array) -> Contact:
+    """The planes of the body's faces [F, 3] whose centroids are nearest to positions [V, 3] m, as in HOOD.
+
+    Args:
+        body, body_next: [B, 3] m at this frame and the next.
+    """
+    (point, normal), (point_next, normal_next) = centroids(body, faces), centroids(body_next, faces)
+    face = nearest_point(positions, point)
+    return Contact(point[face], point_next[face], normal[face], normal_next[face], nearest_point(positions, body))
+
+
+def centroids(vertices: Array, faces: Array) -> tuple[Array, Array]:
+    """Centroids [F, 3] m and unit normals [F, 3] of the faces of a body [B, 3] m."""
+    corners = vertices[faces]
+    return jnp.mean(corners, axis=1), _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
+
+def distance(positions: Array, points: Array, normals: Array) -> Array:
+    """Signed distance [V] m of positions [V, 3] m to their planes, positive outside."""
+    return jnp.sum((positions - points) * normals, axis=-1)
+
+
+def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
+    """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on; if it is a border."""
+    normals = _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    faces = patches.faces
+    weighted = _angles(corners)[:, :, None] * normals[:, None]
+    around = jnp.zeros_like(body).at[faces.reshape(-1)].add(weighted.reshape(-1, 3))
+    zero = weights <= 1e-6
+    count = jnp.sum(zero, axis=1)[:, None]
+    across = patches.across[face, jnp.argmax(zero, axis=1)]
+    corner = faces[face, jnp.argmax(weights, axis=1)]
+    border = jnp.where(count[:, 0] == 1, across == face, (count[:, 0] > 1) & patches.border[corner])
+    edge = normals[face] + normals[across]
+    return _unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
+
+
+def _areas(corners: Array) -> Array:
+    """Areas [V] m^2 of triangles [V, 3, 3] m."""
+    across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * jnp.sqrt(jnp.sum(across * across, axis=-1))
+
+
+def _angles(corners: Array) -> Array:
+    """Interior angles [F, 3] rad."""
+    sides = [_unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
+    cosines = [-jnp.sum(sides[k] * sides[k - 1], axis=-1) for k in range(3)]
+    return jnp.arccos(jnp.clip(jnp.stack(cosines, axis=1), -1.0, 1.0))
+
+
+def _axes(corners: Array) -> Array:
+    """Orthonormal axes [V, 3, 3], as columns, that go with triangles [V, 3, 3] m."""
+    along = _unit(corners[:, 1] - corners[:, 0])
+    normal = _unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
+    return jnp.stack([along, jnp.cross(normal, along), normal], axis=-1)
+
+
+def _unit(vectors: Array) -> Array:
+    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
+    return jnp.where(squared > 0, vectors / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

@@ -1,0 +1,94 @@
+"""The incremental potential of one time step: its terms, and their weighted sum (20)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from clothjax.config import PhysicsConfig
+from clothjax.physics import contact_search
+from clothjax.physics.energies import bending, collision, friction, gravity, inertia, stretching
+from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, SelfContact
+
+
+class TimeStep(NamedTuple):
+    """Everything the incremental potential of a step depends on, but the new positions."""
+
+    position: Array  # [V, 3] m, now
+    velocity: Array  # [V, 3] m per step, so that position + velocity is the inertial prediction
+    mass: Array  # [V] kg
+    rest: Rest
+    material: Material
+    contact: Contact | None  # None where there is no body
+    touching: Array | None  # [V] bool, in contact now; None where there is no friction
+    timestep: Array  # s
+    edge_contact: EdgeContact | None = None
+    self_contact: SelfContact | None = None
+
+
+def touching(position: Array, contact: Contact, radius: float) -> Array:
+    """Whether each vertex [V, 3] m is within `radius` m of its contact plane."""
+    return contact_search.distance(position, contact.point, contact.normal) < radius
+
+
+def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+    """Every term of the incremental potential at new positions [V, 3] m, element by element, in J.
+
+    The sums of these are what training minimises and what the reference solver minimises: there is no other energy.
+    """
+    moved = new - step.position
+    contact = step.contact
+    terms = {
+        "stretching": stretching(
+            new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
+        ),
+        "bending": bending(new[mesh.hinges], step.rest.hinge_area, step.rest.hinge_angle, step.material.bending),
+        # the height gained in the step: the same force as the height, without its large constant
+        "gravity": gravity(moved[:, 1], step.mass),
+        "inertia": inertia(moved - step.velocity, step.mass, step.timestep),
+    }
+    if contact is not None:
+        gap = contact_search.distance(new, contact.point_next, contact.normal_next)
+        terms["collision"] = config.collision_stiffness * collision(gap, config.collision_offset)
+    if step.touching is not None:
+        normal = contact.normal + contact.normal_next
+        length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
+        terms["friction"] = friction(
+            moved - (contact.point_next - contact.point),
+            normal / length,
+            step.mass,
+            step.touching,
+            config.friction_coefficient,
+            config.friction_smoothing,
+        )
+    if step.edge_contact is not None:
+        terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config)
+    if step.self_contact is not None:
+        points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
+        terms["self_collision"] = self_collision(points, step.self_contact, config)
+    return {name: values for name, values in terms.items() if name not in config.without}
+
+
+def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig) -> Array:
+    """Collision energy [...] J of edges [..., 2, 3] m at the places that touch."""
+    start, end = ends[..., 0, :], ends[..., 1, :]
+    # differences first: far from the origin the place itself is coarse
+    offset = (start - contact.point_next) + contact.place[..., None] * (end - start)
+    distance = jnp.sum(offset * contact.normal_next, axis=-1)
+    return config.collision_stiffness * collision(distance, config.collision_offset)
+
+
+def self_collision(points: Array, contact: SelfContact, config: PhysicsConfig) -> Array:
+    """Collision energy [...] J of vertices and the corners of the triangles they may touch [..., 4, 3] m."""
+    offset = jnp.sum(contact.weights[..., :, None] * (points[..., :1, :] - points[..., 1:, :]), axis=-2)
+    distance = jnp.sum(offset * contact.normal, axis=-1)
+    return config.collision_stiffness * collision(distance, config.self_offset)
+
+
+def energies(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+    """The terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
+    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config).items()}
+
+
+def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
+    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises (11)."""
+    return sum(energies(new, step, mesh, config).values())

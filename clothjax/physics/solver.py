@@ -1,0 +1,354 @@
+"""The reference solver: a time step of the cloth as the minimum of the potential that training minimises.
+
+Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how
+far a network is from the optimum; it is never used to train.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from clothjax.config import PhysicsConfig
+from clothjax.physics import contact_search, energies, incremental_potential
+from clothjax.physics.incremental_potential import TimeStep
+from clothjax.types import Array, Mesh
+
+VERTEX_TERMS = ("gravity", "inertia", "friction", "collision")
+CG_ITERATIONS = 600
+SHORTEST_STEP = 1e-8
+ROUNDING = 1e-13  # of the sum of all energies, without signs
+TORN = 2.0  # times the length at rest
+SUNK = 0.01  # m
+TOLERANCE = 1e-6  # of the remaining force, over the weight
+
+
+class Structure(NamedTuple):
+    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and which element blocks each sums."""
+
+    indptr: np.ndarray  # [V + 1] int32
+    indices: np.ndarray  # [N] int32, column of each block
+    diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
+    gather: scipy.sparse.csr_array  # [N, P] ones, where block n sums the block of a pair of corners of an element
+
+
+class SolverInfo(NamedTuple):
+    """How a solve ended."""
+
+    converged: bool
+    iterations: int
+    gradient_norm: float  # N, of the free vertices
+    relative_gradient: float  # gradient_norm over the norm of the free vertices' weights
+    energy: float  # J
+    stretch: float  # the largest of a face in any direction, 1 at rest
+    depth: float  # m, of the free vertex that is farthest behind the surface that it may touch
+
+    @property
+    def ok(self) -> bool:
+        """Whether this is cloth, too: a minimum can be of a step that nothing could have taken well."""
+        return self.converged and self.stretch < TORN and self.depth < SUNK
+
+
+def structure(step: TimeStep, mesh: Mesh) -> Structure:
+    """The sparsity pattern of the Hessian of a time step."""
+    count = len(step.mass)
+    rows, columns = [], []
+    for corners in _corners(step, mesh):
+        pairs = (*corners.shape, corners.shape[1])
+        rows.append(np.broadcast_to(corners[:, :, None], pairs).reshape(-1))
+        columns.append(np.broadcast_to(corners[:, None, :], pairs).reshape(-1))
+    key = np.concatenate(rows).astype(np.int64) * count + np.concatenate(columns)
+    blocks, target = np.unique(key, return_inverse=True)
+    row, column = blocks // count, blocks % count
+    gather = scipy.sparse.csr_array(
+        (np.ones(len(key)), (target.reshape(-1), np.arange(len(key)))), shape=(len(blocks), len(key))
+    )
+    indptr = np.searchsorted(row, np.arange(count + 1))
+    return Structure(indptr.astype(np.int32), column.astype(np.int32), np.flatnonzero(row == column), gather)
+
+
+def _corners(step: TimeStep, mesh: Mesh) -> list[np.ndarray]:
+    """Vertices of the elements that the potential is a sum over, kind by kind."""
+    vertices = np.arange(len(step.mass))[:, None]
+    kinds = [np.asarray(mesh.faces), np.asarray(mesh.hinges), vertices]
+    if step.edge_contact is not None:
+        kinds.append(np.asarray(mesh.edges))
+    if step.self_contact is not None:
+        kinds.append(np.concatenate([vertices, step.self_contact.corners], axis=1))
+    return kinds
+
+
+def solve_step(
+    new0: Array,
+    step: TimeStep,
+    mesh: Mesh,
+    pinned: Array,
+    config: PhysicsConfig,
+    *,
+    tolerance: float = TOLERANCE,
+    max_iterations: int = 500,
+) -> tuple[np.ndarray, SolverInfo]:
+    """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
+
+    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned
+    by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The
+    minimum is a local one, of which folds have many: compare energies, not positions. Contact planes and the
+    friction mask are those of `step`, so the potential is smooth.
+
+    Args:
+        new0: [V, 3] m, where to start; pinned vertices stay there.
+        step: the time step; taken to float64.
+        pinned: [V] bool.
+        config: constants of contact and friction.
+        tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the
+            norm of their weights. This does not depend on the start, where penetration can make any force.
+        max_iterations: Newton iterations.
+
+    Returns:
+        Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met, `ok`
+        also where a face is stretched to twice its length or a vertex is deep in the body.
+
+    Raises:
+        ValueError: a start that is not finite, or a vertex without mass.
+    """
+    x = np.array(new0, np.float64)
+    step = jax.tree.map(to_float64, step)
+    _check(x, step)
+    step, mesh = _present(step, jax.tree.map(np.asarray, mesh), config)
+    pattern = structure(step, mesh)
+    free = np.broadcast_to(~np.asarray(pinned, bool)[:, None], x.shape)
+    weight = max(float(np.linalg.norm(energies.GRAVITY * step.mass[free[:, 0]])), np.finfo(np.float64).tiny)
+
+    with jax.enable_x64(True):
+        evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config)
+        energy, gradient, _ = _host(evaluate(x), free)
+        iterations = 0
+        while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
+            exact, semidefinite = hessians(x, step, mesh, pattern, config)
+            if not (np.isfinite(exact).all() and np.isfinite(semidefinite).all()):
+                break
+            # inexact far away, more exact as the gradient falls: the last iterations converge superlinearly
+            forcing = min(0.1, np.sqrt(0.1 * np.linalg.norm(gradient) / weight))
+            direction = _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing)
+            iterations += 1
+            x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
+            if not moved:
+                break
+        stretch, depth = (float(value) for value in _condition(x, step, mesh, free[:, 0]))
+    norm = float(np.linalg.norm(gradient))
+    return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy, stretch, depth)
+
+
+def _present(step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[TimeStep, Mesh]:
+    """The step and the mesh without the hinges of a scene that has no bending."""
+    if "bending" not in config.without:
+        return step, mesh
+    rest = step.rest._replace(hinge_area=step.rest.hinge_area[:0], hinge_angle=step.rest.hinge_angle[:0])
+    return step._replace(rest=rest), mesh._replace(hinges=mesh.hinges[:0])
+
+
+def hessians(
+    x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
+
+    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the
+    square of the residual's gradient (Gauss-Newton); of terms of single vertices, the positive eigenvalues.
+    """
+    return tuple(
+        (pattern.gather @ np.asarray(blocks).reshape(-1, 9)).reshape(-1, 3, 3)
+        for blocks in _element_hessians(x, step, mesh, config)
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[Array, Array]:
+    """Blocks [P, 3, 3] N/m of all pairs of corners of all elements, in the order of `_corners`: exact, semidefinite."""
+    rest, material = step.rest, step.material
+    corners, hinges = x[mesh.faces], x[mesh.hinges]
+
+    def face_energy(points, inverse, area):
+        return energies.stretching(points[None], inverse[None], area[None], material.mu, material.lam)[0]
+
+    def hinge_energy(points, area, angle):
+        return energies.bending(points[None], area[None], angle[None], material.bending)[0]
+
+    def vertex_energy(new):
+        elements = incremental_potential.elements(new, step, mesh, config)
+        return sum((jnp.sum(elements[name]) for name in VERTEX_TERMS if name in elements), jnp.zeros((), x.dtype))
+
+    vertex_gradient = jax.grad(vertex_energy)
+
+    # every vertex term depends on one vertex only, so three directions give all 3 x 3 blocks
+    axes = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype)[:, None, :], (3, *x.shape))
+    columns = jax.vmap(lambda axis: jax.jvp(vertex_gradient, (x,), (axis,))[1])(axes)
+    vertex = jnp.moveaxis(columns, 0, -1)
+    values, vectors = jnp.linalg.eigh(vertex)
+    positive = jnp.einsum("vab,vb,vcb->vac", vectors, jnp.maximum(values, 0.0), vectors)
+
+    exact = [
+        jax.vmap(jax.hessian(face_energy))(corners, rest.inverse, rest.face_area),
+        jax.vmap(jax.hessian(hinge_energy))(hinges, rest.hinge_area, rest.hinge_angle),
+        vertex[:, None, :, None],
+    ]
+    semidefinite = [
+        _stretching_semidefinite(corners, step),
+        _bending_semidefinite(hinges, step),
+        positive[:, None, :, None],
+    ]
+    # the last two are convex
+    convex = []
+    if step.edge_contact is not None:
+        energy = partial(incremental_potential.edge_collision, config=config)
+        convex.append(jax.vmap(jax.hessian(energy))(x[mesh.edges], step.edge_contact))
+    if step.self_contact is not None:
+        energy = partial(incremental_potential.self_collision, config=config)
+        points = jnp.concatenate([x[:, None], x[step.self_contact.corners]], axis=1)
+        convex.append(jax.vmap(jax.hessian(energy))(points, step.self_contact))
+
+    def pairs(elements: list[Array]) -> Array:
+        return jnp.concatenate([jnp.swapaxes(element, 2, 3).reshape(-1, 3, 3) for element in elements])
+
+    return pairs(exact + convex), pairs(semidefinite + convex)
+
+
+def _stretching_semidefinite(corners: Array, step: TimeStep) -> Array:
+    """[F, 3, 3, 3, 3] N/m, the Hessian of stretching with the second Piola-Kirchhoff stress clamped."""
+    inverse, mu, lam = step.rest.inverse, step.material.mu, step.material.lam
+    eye = jnp.eye(2, dtype=corners.dtype)
+    # F = sum_i x_i b_i^T
+    b = jnp.concatenate([inverse, -jnp.sum(inverse, axis=1, keepdims=True)], axis=1)
+    deformation = jnp.einsum("fia,fip->fap", corners, b)
+    strain = energies.green_strain(corners, inverse)
+    trace = strain[:, 0, 0] + strain[:, 1, 1]
+    stress = 2.0 * mu * strain + lam * trace[:, None, None] * eye[None]
+
+    mean = 0.5 * (stress[:, 0, 0] + stress[:, 1, 1])
+    spread = 0.5 * (stress[:, 0, 0] - stress[:, 1, 1])
+    radius = jnp.sqrt(spread * spread + stress[:, 0, 1] * stress[:, 0, 1]) + 1e-12 * mu
+    high, low = jnp.maximum(mean + radius, 0.0), jnp.maximum(mean - radius, 0.0)
+    # the isotropic function that clamps both principal values, as slope * stress + shift * I
+    slope = (high - low) / (2.0 * radius)
+    shift = high - slope * (mean + radius)
+    clamped = slope[:, None, None] * stress + shift[:, None, None] * eye[None]
+
+    half = 0.5 * jnp.einsum("fip,faq->fpqia", b, deformation)
+    change = half + jnp.swapaxes(half, 1, 2)  # of the strain, with every coordinate
+    trace_change = change[:, 0, 0] + change[:, 1, 1]
+    blocks = 2.0 * mu * jnp.einsum("fpqia,fpqjb->fiajb", change, change)
+    blocks = blocks + lam * jnp.einsum("fia,fjb->fiajb", trace_change, trace_change)
+    geometric = jnp.einsum("fip,fpq,fjq->fij", b, clamped, b)
+    blocks = blocks + jnp.einsum("fij,ab->fiajb", geometric, jnp.eye(3, dtype=corners.dtype))
+    return (step.rest.face_area * energies.THICKNESS)[:, None, None, None, None] * blocks
+
+
+def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
+    """[H, 4, 3, 4, 3] N/m, Gauss-Newton of bending: k / (4 A) r'^T r' with r = l (theta - theta_0)."""
+
+    def residual(points, rest_angle):
+        edge = points[1] - points[0]
+        squared = jnp.sum(edge * edge)
+        length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+        return jnp.where(squared > 0, length, 0.0) * (energies.dihedral_angle(points[None])[0] - rest_angle)
+
+    slope = jax.vmap(jax.grad(residual))(hinges, step.rest.hinge_angle)
+    stiffness = step.material.bending / (4.0 * step.rest.hinge_area)
+    return jnp.einsum("h,hia,hjb->hiajb", stiffness, slope, slope)
+
+
+@partial(jax.jit, static_argnames="config")
+def _value_and_gradient(x, step, mesh, config):
+    """The potential, its gradient, and what rounding can do to the potential."""
+
+    def potential(x):
+        elements = incremental_potential.elements(x, step, mesh, config)
+        return sum(jnp.sum(values) for values in elements.values()), elements
+
+    (energy, elements), gradient = jax.value_and_grad(potential, has_aux=True)(x)
+    return energy, gradient, ROUNDING * sum(jnp.sum(jnp.abs(values)) for values in elements.values())
+
+
+@jax.jit
+def _condition(x: Array, step: TimeStep, mesh: Mesh, free: Array) -> tuple[Array, Array]:
+    """The largest stretch of a face, and the depth in m of the deepest free vertex."""
+    strain = energies.green_strain(x[mesh.faces], step.rest.inverse)
+    mean, spread = 0.5 * (strain[:, 0, 0] + strain[:, 1, 1]), 0.5 * (strain[:, 0, 0] - strain[:, 1, 1])
+    largest = mean + jnp.sqrt(spread * spread + strain[:, 0, 1] * strain[:, 0, 1])
+    stretch = jnp.sqrt(jnp.maximum(1.0 + 2.0 * jnp.max(largest), 0.0))
+    depth = jnp.zeros((), x.dtype)
+    if step.contact is not None:
+        distance = contact_search.distance(x, step.contact.point_next, step.contact.normal_next)
+        depth = jnp.max(jnp.where(free, -distance, 0.0), initial=0.0)
+    return stretch, depth
+
+
+def _host(result, free) -> tuple[float, np.ndarray, float]:
+    energy, gradient, rounding = result
+    return float(energy), np.where(free, np.asarray(gradient), 0.0), float(rounding)
+
+
+def _check(x: np.ndarray, step: TimeStep) -> None:
+    bad = ~np.isfinite(x).all(axis=1)
+    if bad.any():
+        raise ValueError(f"solve_step: new0[{np.argmax(bad)}] is {x[np.argmax(bad)]}; a start must be finite")
+    if not (step.mass > 0).all():
+        vertex = np.argmin(step.mass)
+        raise ValueError(
+            f"solve_step: vertex {vertex} has mass {step.mass[vertex]} kg, which must be > 0; "
+            "remove vertices that belong to no face of positive area"
+        )
+
+
+def to_float64(leaf: Array) -> np.ndarray:
+    """An array of floats in float64, any other as it is."""
+    leaf = np.asarray(leaf)
+    return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
+
+
+def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
+    """A descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature."""
+    # with D = L L^T the diagonal blocks, solve (L^-1 H L^-T) y = -L^-1 g: no preconditioner inside the loop
+    root = np.linalg.inv(np.linalg.cholesky(np.asarray(semidefinite)[pattern.diagonal]))
+    rows = np.repeat(np.arange(len(root)), np.diff(pattern.indptr))
+    exact = np.asarray(exact) * (free[rows, :1] & free[pattern.indices, :1])[:, :, None]
+    scaled = root[rows] @ exact @ root[pattern.indices].transpose(0, 2, 1)
+    matrix = scipy.sparse.bsr_array((scaled, pattern.indices, pattern.indptr))
+    residual = -(root @ gradient[:, :, None]).reshape(-1)
+    solution, search = np.zeros_like(residual), residual.copy()
+    squared = residual @ residual
+    limit = forcing**2 * squared
+    for iteration in range(CG_ITERATIONS):
+        product = matrix @ search
+        curvature = search @ product
+        if curvature <= 0:
+            if iteration == 0:
+                solution = search
+            break
+        length = squared / curvature
+        solution += length * search
+        residual -= length * product
+        previous, squared = squared, residual @ residual
+        if squared < limit:
+            break
+        search = residual + (squared / previous) * search
+    return (root.transpose(0, 2, 1) @ solution.reshape(-1, 3, 1))[:, :, 0]
+
+
+def _line_search(evaluate, x, energy, gradient, direction, free):
+    """Backtracking (Armijo) from x; the last result is whether a better point was found."""
+    slope = float(np.sum(gradient * direction))
+    squared = float(np.sum(gradient * gradient))
+    length = 1.0
+    while length >= SHORTEST_STEP:
+        trial = x + length * direction
+        trial_energy, trial_gradient, rounding = _host(evaluate(trial), free)
+        lower = trial_energy <= energy + 1e-4 * length * slope
+        # near the minimum the decrease drowns in the rounding of the energy, but not that of the gradient
+        level = abs(trial_energy - energy) <= rounding and float(np.sum(trial_gradient * trial_gradient)) < squared
+        if lower or level:
+            return trial, trial_energy, trial_gradient, True
+        length *= 0.5
+    return x, energy, gradient, False

@@ -1,0 +1,1 @@
+"""Moving meshes as pictures and animation files. Knows no model."""

@@ -1,0 +1,1 @@
+"""A trained garment in use: load, step, specialise. No training, no physics."""

@@ -1,0 +1,375 @@
+"""Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
+
+A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
+the range that they had in training, and a pose that is not finite, or no pose at all, is taken to be the last one:
+whatever comes in, the garment stays finite, and when the input is ordinary again the code forgets the rest within a
+second or two. `State.ok` tells of every frame whether nothing of this was needed.
+
+A model is one wearer's: what betas and material decide is in `Model.wearer`, all else a crowd shares.
+`clothjax.runtime.specialise.specialise` makes it smaller and faster; it then runs through the same functions.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.body import skinning
+from clothjax.config import Config
+from clothjax.files import storage
+from clothjax.networks import normalisation, psi
+from clothjax.networks.normalisation import Normalizers
+from clothjax.runtime import trained
+from clothjax.types import Array, Body, Garment, Material, Motion, Pose
+
+FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
+HIGHEST = jax.lax.Precision.HIGHEST
+
+
+class Layer(NamedTuple):
+    """A dense layer; without a kernel, what it would make of its input comes with that."""
+
+    kernel: Array | None  # [inputs, outputs]
+    bias: Array  # [outputs]
+
+
+class Bounds(NamedTuple):
+    """The range that training has seen, and how far out of it is not worth a word."""
+
+    low: Array
+    high: Array
+    slack: Array
+
+
+class Network(NamedTuple):
+    """Psi from pose inputs [P] and the code [C] to blend shapes [K, 3 V]: what all characters share."""
+
+    pose: Array  # [P, H] kernel of the predictor's first layer
+    pose_mean: Array  # [P] of the inputs, taken from them first
+    pose_bounds: Bounds  # [P] of what is left
+    code: Layer  # [C, H] the same layer's, without the wearer's part of the bias
+    hidden: tuple[Layer, ...]  # of the predictor, the last of which gives [C]
+    code_bounds: Bounds  # [C]
+    first: Array  # [C] the code before the first frame
+    read: Layer  # [C, D] the decoder's first layer, or [C, D + K] with what it gives the weights directly
+    decoder: tuple[Layer, ...]  # its others, to [K]
+    mix: Layer | None  # [K, K'] from its weights to those of fewer shapes
+    shapes: Array  # [K, 3 V] m, or [K', 3 V], the x of all vertices first; zero where they are pinned
+    weights: Array  # [J', V] skinning weights of the joints `Model.moving`
+
+
+class Wearer(NamedTuple):
+    """What the betas and the material of one character decide."""
+
+    bias: Array  # [H] added to the predictor's first layer
+    template: Array  # [3, V] m, the shaped garment in the canonical pose
+    joints: Array  # [J, 3] m of the shaped body
+    known: Array  # bool, whether training had such
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("network", "wearer", "faces"),
+    meta_fields=("names", "parents", "kept", "moving", "config"),
+)
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A garment on a character, ready to run: arrays as a pytree, the rest static."""
+
+    network: Network
+    wearer: Wearer  # of a crowd, with a leading axis [N]
+    faces: Array  # [F, 3] int32
+    names: tuple[str, ...]  # of the joints
+    parents: tuple[int, ...]
+    kept: tuple[int, ...]  # joints whose pose is an input
+    moving: tuple[int, ...]  # joints that move the garment
+    config: Config
+
+
+class State(NamedTuple):
+    """What the model carries from frame to frame."""
+
+    latent: Array  # [C] the code, in standard deviations; of a specialised model what is made of it
+    rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
+    positions: Array  # [2, J, 3] m of their joints, from the root's canonical place
+    translation: Array  # [2, 3] m
+    ok: Array  # bool, whether the last frame was within the range of training
+
+
+def build(
+    config: Config,
+    garment: Garment,
+    body: Body,
+    names: tuple[str, ...],
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    *,
+    betas: Array | None = None,
+    material: Material | None = None,
+) -> Model:
+    """A model of one character; `betas` [S] default to the mean body, the material to the configured one.
+
+    Scales and constants of the inputs are taken into the layers that read them.
+    """
+    betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
+    if betas.shape != (body.shapedirs.shape[-1],):
+        raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
+    cloth = config.material
+    if material is None:
+        material = Material(cloth.density, cloth.mu, cloth.lam, cloth.bending)
+    material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
+    network, wearer = _arrays(garment, body, garment_params, predictor, normalizers, betas, material, config)
+    return Model(
+        network=network,
+        wearer=wearer,
+        faces=jnp.asarray(garment.faces),
+        names=tuple(names),
+        parents=tuple(int(p) for p in body.parents),
+        kept=tuple(int(k) for k in psi.input_joints(names, config.stage2)),
+        moving=tuple(range(len(names))),
+        config=config,
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def _arrays(
+    garment: Garment,
+    body: Body,
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    betas: Array,
+    material: Material,
+    config: Config,
+) -> tuple[Network, Wearer]:
+    """The arrays of a model, all in one program: it starts in a fraction of the time that one by one they take."""
+    constants, known = psi.bounded_constants(psi.constant_inputs(betas, material, config.material), config)
+    latent, pose = normalizers
+    size = len(latent.mean)
+    first, *hidden = _layers(predictor)
+    of_code, of_pose, of_constants = jnp.split(first.kernel, [size, size + len(pose.mean)])
+    read, *decoder = _layers(garment_params["decoder"])
+    if config.model.decoder_skip:
+        skip = jnp.asarray(garment_params["skip"])
+        read = Layer(jnp.concatenate([read.kernel, skip], axis=1), jnp.pad(read.bias, (0, skip.shape[1])))
+    shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
+    network = Network(
+        pose=of_pose / pose.deviation[:, None],
+        pose_mean=pose.mean,
+        pose_bounds=Bounds(
+            pose.low * pose.deviation, pose.high * pose.deviation, jnp.full(len(pose.mean), normalisation.SLACK)
+        ),
+        code=Layer(of_code, first.bias),
+        hidden=tuple(hidden),
+        code_bounds=Bounds(latent.low, latent.high, jnp.full(size, normalisation.CODE_SLACK)),
+        first=-latent.mean / latent.deviation,
+        read=Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel),
+        decoder=tuple(decoder),
+        mix=None,
+        shapes=jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1),
+        weights=jnp.asarray(garment.weights).T,
+    )
+    wearer = Wearer(
+        bias=constants @ of_constants,
+        template=skinning.shaped_vertices(garment, betas).T,
+        joints=skinning.shaped_joints(body, betas),
+        known=known,
+    )
+    return network, wearer
+
+
+def _layers(mlp: dict) -> list[Layer]:
+    layers = (mlp[f"dense_{i}"] for i in range(len(mlp)))
+    return [Layer(jnp.asarray(layer["kernel"]), jnp.asarray(layer["bias"])) for layer in layers]
+
+
+def crowd(models: Sequence[Model]) -> Model:
+    """One model of many characters in the same garment, for `step_crowd`.
+
+    Args:
+        models: of different wearers, otherwise the same.
+
+    Raises:
+        ValueError: if there is none, or one differs from the first in more than its wearer.
+    """
+    if not models:
+        raise ValueError("a crowd needs at least one model")
+    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=None)) for model in models)
+    for number, (leaves, structure) in enumerate(others, 1):
+        same = structure == first[1] and all(a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0]))
+        if not same:
+            raise ValueError(
+                f"models[{number}] differs from models[0] in more than its wearer: a crowd is of one garment, and of "
+                "models whose blend shapes `specialise` has not fitted to their wearers"
+            )
+    wearers = jax.tree.map(lambda *each: jnp.stack(each), *(model.wearer for model in models))
+    return dataclasses.replace(models[0], wearer=wearers)
+
+
+def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
+    """The model of a finished run, or a garment that comes with the library.
+
+    Args:
+        run: the folder of a run or of a packed model, or a name of `trained.shipped()`, as "skirt".
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
+    """
+    run = trained.folder(str(run)) if str(run) in trained.shipped() else run
+    config, garment, predictor, normalizers = trained.psi(run)
+    body = storage.load_body(config.body)
+    return build(
+        config,
+        storage.load_garment(config.garment, body),
+        body,
+        storage.joint_names(config.body),
+        garment,
+        predictor,
+        normalizers,
+        betas=betas,
+        material=material,
+    )
+
+
+@jax.jit
+def initial_state(model: Model, pose: Pose) -> State:
+    """The state before the first frame: the code is zero and the character has been standing in `pose`.
+
+    The canonical pose takes the place of one that is not finite.
+    """
+    pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
+    still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
+    pose, ok = _sound_or(pose, still)
+    _, positions = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
+    return State(model.network.first, *(jnp.stack([x, x]) for x in (pose.rotations, positions, pose.translation)), ok)
+
+
+def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
+    # NaN is not less than anything
+    sound = jnp.all(jnp.abs(pose.rotations) < 2.0) & jnp.all(jnp.abs(pose.translation) < FARTHEST)
+    return jax.tree.map(lambda x, y: jnp.where(sound, x, y), pose, other), sound
+
+
+@partial(jax.jit, static_argnames="vertices")
+def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
+    """The next frame: a new state, and the garment's vertices [V, 3] m in the world.
+
+    Args:
+        pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
+        vertices: False for a garment that nobody sees: then the state goes on, and there are no vertices.
+    """
+    network, wearer, parents = model.network, model.wearer, np.array(model.parents)
+    pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
+    turns, places = skinning.forward_kinematics(pose.rotations, wearer.joints, parents)
+    rotations, positions, translation = (
+        jnp.concatenate([new[None], old])
+        for new, old in zip((pose.rotations, places, pose.translation), state[1:4], strict=True)
+    )
+    advance = translation[:2] - translation[1:]
+    inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.kept), model.config.fps)
+    inputs, ordinary = normalisation.bounded(inputs - network.pose_mean, *network.pose_bounds)
+    latent, inside = normalisation.bounded(
+        predict(network, state.latent, inputs, wearer.bias, model.config), *network.code_bounds
+    )
+    ok = sound & ordinary & wearer.known & inside
+    following = State(latent, rotations[:2], positions[:2], translation[:2], ok)
+    if not vertices:
+        return following, None
+    displaced = jnp.matmul(blend_weights(network, latent, model.config), network.shapes, precision=HIGHEST)
+    transforms = skinning.bound_transforms(turns, places, wearer.joints)
+    garment = wearer.template + displaced.reshape(3, -1)
+    return following, _skin(garment, network.weights, transforms[np.array(model.moving)], pose.translation)
+
+
+def predict(network: Network, latent: Array, inputs: Array, bias: Array, config: Config) -> Array:
+    """The next code [C] from the current one, pose inputs [P] and the wearer's part [H] of the first layer."""
+    kernel, common = network.code
+    x = inputs @ network.pose + (latent[: len(bias)] if kernel is None else latent @ kernel) + common + bias
+    for kernel, bias in network.hidden:
+        x = jax.nn.relu(x) @ kernel + bias
+    return (1.0 - config.stage2.latent_decay) * latent + x
+
+
+def blend_weights(network: Network, latent: Array, config: Config) -> Array:
+    """Weights of `Network.shapes` of a code [C]."""
+    kernel, bias = network.read
+    read = bias + (latent[-len(bias) :] if kernel is None else latent @ kernel)
+    wide = len(network.decoder[0].kernel)
+    x, beside = read[:wide], read[wide:]
+    for kernel, bias in network.decoder:
+        x = jax.nn.relu(x) @ kernel + bias
+    weights = x + beside if config.model.decoder_skip else x
+    weights = jax.nn.relu(weights) if config.model.blendshape_relu else weights
+    return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
+
+
+def _skin(garment: Array, weights: Array, transforms: Array, translation: Array) -> Array:
+    """Vertices [V, 3] m of a garment [3, V] skinned by the transforms [J', 3, 4] of joints with weights [J', V].
+
+    Coordinate by coordinate: long rows are what a processor is fast at.
+    """
+    flat = transforms.reshape(-1, 12).T
+    rows = jnp.matmul(flat, weights, precision=HIGHEST).reshape(3, 4, -1)
+    x, y, z = (rows[:, i] * garment[None, i] for i in range(3))
+    return (x + y + z + rows[:, 3] + translation[:, None]).T
+
+
+@jax.jit
+def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
+    """Whether a step has changed nothing, bool: until the pose changes, no other need be taken.
+
+    Args:
+        before, after: the states around the step.
+        tolerance: of the code, in standard deviations; a tenth of it, in rad and m, of the poses.
+    """
+    still = [jnp.max(jnp.abs(x[0] - x[1])) < 0.1 * tolerance for x in (after.rotations, after.translation)]
+    return still[0] & still[1] & (jnp.max(jnp.abs(after.latent - before.latent)) < tolerance)
+
+
+@jax.jit
+def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
+    """`step` for every character of a `crowd`: states and poses have a leading axis [N], and so have the vertices."""
+    return jax.vmap(partial(step, vertices=True), (_axes(model), 0, 0))(model, states, poses)
+
+
+def _axes(model: Model) -> Model:
+    """What of a crowd's model has an axis for its characters."""
+    return dataclasses.replace(model, network=None, faces=None, wearer=0)
+
+
+def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
+    """A whole motion: vertices [T, V, 3] m in the world, and `ok` [T], as in `State`, of each frame.
+
+    The first frame is the garment settled on the standing first pose.
+
+    Raises:
+        ValueError: for a motion of another number of joints, or frames a second, than the model's.
+    """
+    if motion.rotations.shape[1] != len(model.names):
+        raise ValueError(f"the motion has {motion.rotations.shape[1]} joints, the garment's body {len(model.names)}")
+    if abs(motion.fps - model.config.fps) > 1e-3:
+        raise ValueError(
+            f"the motion has {motion.fps:g} frames a second, the garment was trained for {model.config.fps:g}: "
+            "resample the motion"
+        )
+    return _animate(model, motion)
+
+
+@jax.jit
+def _animate(model: Model, motion: Motion) -> tuple[Array, Array]:
+    poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
+    first = jax.tree.map(lambda x: x[0], poses)
+
+    def frame(state, pose):
+        state, vertices = step(model, state, pose)
+        return state, (vertices, state.ok)
+
+    return jax.lax.scan(frame, initial_state(model, first), poses)[1]

@@ -1,0 +1,219 @@
+"""What training left: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
+
+A packed model is a folder with `model.npz` and `config.yaml`, and `report.json` where that says how it was made. Large
+matrices are kept in eight bits with a scale for each column (`NAME` and `NAME|scale`), the blend shapes and the
+preconditioner in half precision, all else as it is.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from clothjax.config import Config
+from clothjax.files import checkpoint, configuration, storage
+from clothjax.networks.normalisation import Normalizers, Scale, Statistics, identity
+from clothjax.types import Material
+
+MODELS = storage.ASSETS / "models"
+WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
+STAGES = ("stage1", "stage2", "tuning")
+HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
+LARGE = 2000  # entries of a matrix that is worth eight bits
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the garments that come with the library."""
+    return tuple(sorted(path.parent.name for path in MODELS.glob(f"*/{WEIGHTS}")))
+
+
+def folder(name: str) -> Path:
+    """Where a garment that comes with the library is.
+
+    Raises:
+        ValueError: for a name that is none.
+    """
+    if name not in shipped():
+        raise ValueError(f"no garment called {name!r} comes with clothjax; there are: {', '.join(shipped()) or 'none'}")
+    return MODELS / name
+
+
+def phi(run: str | Path) -> tuple[Config, dict]:
+    """The configuration and the `params` and `statistics` of Phi, of a run or a packed model.
+
+    Raises:
+        ValueError: if there is no readable one, as of a peer's run.
+    """
+    config, model = network(run)
+    if config.peer.network:
+        raise ValueError(
+            f"{run}: is of a peer's network ({config.peer.network}), which has no Phi: only experiments.evaluate and "
+            "experiments.benchmark use it"
+        )
+    return config, model
+
+
+def network(run: str | Path) -> tuple[Config, dict]:
+    """As `phi`, or a peer's network in its place.
+
+    Raises:
+        ValueError: if there is no readable one.
+    """
+    if packed(run):
+        config, parts = _unpack(Path(run))
+        params, statistics = parts["phi"], parts["statistics"]
+    else:
+        config = _config(Path(run))
+        wanted = ("average",) if config.peer.network else ("average", "statistics")
+        parts, _ = checkpoint.read(Path(run) / "stage1" / "checkpoints", *wanted)
+        params, statistics = parts["average"], _statistics(parts.get("statistics", {}))
+    return config, {"params": params, "statistics": statistics}
+
+
+def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
+    """The configuration, the decoder with its blend shapes, the predictor (after all that trained it) and its
+    normalizers, of a run or a packed model. Of Psi without stage 1, the normalizers change nothing.
+
+    Raises:
+        ValueError: if there is no readable one.
+    """
+    if packed(run):
+        config, parts = _unpack(Path(run))
+        garment, predictor, normalizers = parts["phi"]["garment"], parts["predictor"], parts["normalizers"]
+    elif (config := _config(Path(run))).peer.network:
+        if config.peer.network != "direct":
+            raise ValueError(f"{run}: is of {config.peer.network}, which has no latent predictor to use")
+        params = network(run)[1]["params"]
+        rows = len(params["predictor"]["dense_0"]["kernel"])
+        betas = storage.load_body(config.body).shapedirs.shape[-1]
+        poses = rows - config.model.latent - betas - (len(Material._fields) if config.material.sample else 0)
+        normalizers = Normalizers(identity(config.model.latent), identity(poses))
+        garment, predictor = params["garment"], params["predictor"]
+    else:
+        directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
+        parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
+        config = _config(Path(run))
+        garment, predictor = parts["garment"], parts["average"]
+        for trained_on in later:
+            if checkpoint.steps(trained_on):
+                predictor = checkpoint.read(trained_on, "average")[0]["average"]
+        normalizers = _normalizers(parts["normalizers"])
+    return config, garment, predictor, normalizers
+
+
+def packed(run: str | Path) -> bool:
+    """Whether a folder is a packed model."""
+    return (Path(run) / WEIGHTS).is_file()
+
+
+def made(packed: str | Path) -> dict[str, Any]:
+    """How a packed model was made, as its report says: the `command`, `seed` and `hours` that are known."""
+    path = Path(packed) / REPORT
+    report = json.loads(path.read_text()) if path.is_file() else {}
+    return {name: report[name] for name in ("command", "seed", "hours") if name in report}
+
+
+def pack(run: str | Path, out: str | Path) -> int:
+    """Writes a finished run as a packed model; returns the bytes of its weights.
+
+    Raises:
+        ValueError: if the run is not finished, or Psi was trained on another Phi than the run now has.
+    """
+    config, model = phi(run)
+    _, garment, predictor, normalizers = psi(run)
+    for stage in STAGES:
+        wanted = getattr(config, stage).steps
+        done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
+        if done != wanted:
+            raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
+    decoder = checkpoint.named(model["params"]["garment"])
+    if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(garment).items()):
+        raise ValueError(
+            f"{run}: stage 1 was trained further after stage 2: remove its {', '.join(STAGES[1:])}, and train again"
+        )
+    return write(out, config, model, predictor, normalizers)
+
+
+def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalizers: Normalizers) -> int:
+    """Writes a packed model; returns the bytes of its weights.
+
+    Args:
+        phi: `params` and `statistics`.
+    """
+    parts = {
+        "phi": phi["params"],
+        "statistics": {name: each._asdict() for name, each in phi["statistics"].items()},
+        "predictor": predictor,
+        "normalizers": {name: each._asdict() for name, each in normalizers._asdict().items()},
+    }
+    arrays = {}
+    for name, leaf in checkpoint.named(parts).items():
+        leaf = np.asarray(leaf)
+        if name in HALVED:
+            leaf = leaf.astype(np.float16)
+        elif leaf.ndim > 1 and leaf.size > LARGE:
+            scale = np.maximum(np.abs(leaf).max(axis=tuple(range(leaf.ndim - 1))) / 127, 1e-20).astype(np.float32)
+            arrays[f"{name}|scale"] = scale
+            leaf = np.round(leaf / scale).astype(np.int8)
+        arrays[name] = leaf
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    partial = {name: out / f".{os.getpid()}.{name}" for name in (WEIGHTS, CONFIG)}
+    try:
+        np.savez_compressed(partial[WEIGHTS], **arrays)
+        partial[CONFIG].write_text(yaml.safe_dump(configuration.to_dict(config), sort_keys=False))
+        for name, path in partial.items():
+            os.replace(path, out / name)
+    finally:
+        for path in partial.values():
+            path.unlink(missing_ok=True)
+    return (out / WEIGHTS).stat().st_size
+
+
+def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
+    return {name: Statistics(**each) for name, each in parts.items()}
+
+
+def _normalizers(parts: dict[str, dict]) -> Normalizers:
+    return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
+
+
+def _config(run: Path) -> Config:
+    """The configuration of a run's last stage: those before may have been trained with other settings of later ones."""
+    first, *later = (run / stage / "checkpoints" for stage in STAGES)
+    last = [first, *(folder for folder in later if checkpoint.steps(folder))][-1]
+    return configuration.from_dict(Config, checkpoint.latest(last).config, str(last))
+
+
+def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
+    config = configuration.load(Config, directory / CONFIG)
+    path = directory / WEIGHTS
+    tree: dict = {}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            for name in file.files:
+                if name.endswith("|scale"):
+                    continue
+                leaf = file[name]
+                if leaf.dtype == np.int8:
+                    leaf = leaf * file[f"{name}|scale"]
+                *above, last = name.split("/")
+                node = tree
+                for key in above:
+                    node = node.setdefault(key, {})
+                node[last] = leaf.astype(np.float32)
+        parts = checkpoint.lists(tree)
+        parts["phi"]["garment"]  # all else of a model needs it
+        return config, {
+            "phi": parts["phi"],
+            "predictor": parts["predictor"],
+            "statistics": _statistics(parts["statistics"]),
+            "normalizers": _normalizers(parts["normalizers"]),
+        }
+    except storage.UNREADABLE as error:
+        raise ValueError(
+            f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"
+        ) from error

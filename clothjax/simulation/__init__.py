@@ -1,0 +1,1 @@
+"""A garment on a character, frame by frame, whatever moves it."""

@@ -1,0 +1,146 @@
+"""An experiment's fixed parts, put together from its configuration: files, scene, clips, character."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.body import motion_clips, plausibility, skinning
+from clothjax.body.motion_clips import Clips
+from clothjax.config import Config
+from clothjax.files import storage
+from clothjax.simulation import scene
+from clothjax.simulation.scene import Scene
+from clothjax.types import Body, Garment, Material, Motion
+
+MEASURABLE = 12  # frames of a motion, at least, for all that is measured of it
+
+
+class Experiment(NamedTuple):
+    """What a configuration names, loaded."""
+
+    config: Config
+    names: tuple[str, ...]  # of the joints
+    body: Body  # whole
+    garment: Garment
+    scene: Scene
+
+
+def assemble(config: Config) -> Experiment:
+    """Loads the garment and the body of a configuration and builds their scene."""
+    body = storage.load_body(config.body)
+    garment = storage.load_garment(config.garment, body)
+    return Experiment(config, storage.joint_names(config.body), body, garment, scene.build_scene(garment, body, config))
+
+
+def motion(experiment: Experiment, name: str) -> Motion:
+    """A clip, by asset name or path, checked against the experiment's joints and frame rate."""
+    clip = storage.load_motion(name, experiment.names)
+    if abs(clip.fps - experiment.config.fps) > 1e-3:
+        raise ValueError(
+            f"{name} has {clip.fps} frames a second, the experiment {experiment.config.fps}; "
+            "resample the clip when importing it (data_prep), or set `fps`"
+        )
+    if experiment.scene.still and not _stands(clip):
+        raise ValueError(f"{name} moves, but physics.body is `still`: give a clip of one pose, or set it to `moving`")
+    return clip
+
+
+def _stands(clip: Motion) -> bool:
+    return all(
+        np.abs(np.asarray(part) - np.asarray(part[:1])).max() < 1e-6 for part in (clip.rotations, clip.translation)
+    )
+
+
+def training_motions(config: Config) -> tuple[str, ...]:
+    """The clips to train on: those named, or every embedded one but those kept for evaluation."""
+    if config.motions:
+        return config.motions
+    kept = {Path(name).stem for name in config.evaluation.motions}
+    return tuple(name for name in storage.asset_names("motion") if name not in kept)
+
+
+def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
+    """The training clips on one reel, and the number of frames left out of each for moving impossibly fast."""
+    names = training_motions(experiment.config)
+    motions = [motion(experiment, name) for name in names]
+    bad = [plausibility.bad_frames(clip, experiment.body) for clip in motions]
+    # the kind of motion, as in walk_0 or cmu_01_02: kinds are drawn equally often
+    families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
+    stages = [experiment.config.stage1] + [experiment.config.tuning] * (experiment.config.tuning.steps > 0)
+    shortest = max(max(stage.rollout, stage.rollout_end) for stage in stages) + 1
+    try:
+        reel = motion_clips.concatenate(motions, families, bad, shortest)
+    except ValueError as error:
+        left_out = sum(map(len, bad))
+        raise ValueError(
+            f"{', '.join(names)}: {error}; {left_out} frames were left out, a joint jumps there"
+        ) from error
+    return reel, {name: len(wrong) for name, wrong in zip(names, bad)}
+
+
+def evaluation_motion(experiment: Experiment, name: str | Path) -> Motion:
+    """A motion to measure on, with no more than `evaluation.frames` frames.
+
+    Raises:
+        ValueError: as `motion`, and for fewer frames than can be measured.
+    """
+    clip, most = motion(experiment, name), experiment.config.evaluation.frames
+    clip = Motion(clip.rotations[:most], clip.translation[:most], clip.fps)
+    if len(clip.translation) < MEASURABLE:
+        raise ValueError(
+            f"{name}: {len(clip.translation)} frames to measure on (`evaluation.frames` is {most}); at least "
+            f"{MEASURABLE} are needed"
+        )
+    return clip
+
+
+def windows(clip: Motion) -> Clips:
+    """One clip on a reel of its own, every frame of it usable."""
+    return motion_clips.concatenate([clip], [""], [np.zeros(0, int)], 1)
+
+
+def there_and_back(clip: Motion, frames: int) -> Motion:
+    """A clip played forwards and backwards until it has `frames` frames: long, and nowhere a jump."""
+    count = len(clip.translation)
+    period = max(2 * count - 2, 1)
+    order = np.abs((np.arange(frames) + count - 1) % period - (count - 1))
+    return Motion(clip.rotations[order], clip.translation[order], clip.fps)
+
+
+def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
+    """Betas [S] and material of a thin, the mean and a heavy body in soft, middling and stiff cloth.
+
+    Thin and heavy are `evaluation.betas` standard deviations along the direction in which the body's volume grows most
+    of those in which its height stays.
+    """
+    body, cloth = experiment.body, experiment.config.material
+    count = body.shapedirs.shape[-1]
+
+    def volume_and_height(betas):
+        vertices = np.asarray(skinning.shaped_vertices(body, jnp.asarray(betas, jnp.float32)), np.float64)
+        return np.array([np.linalg.det(vertices[body.faces]).sum() / 6, np.ptp(vertices[:, 1])])
+
+    growth, rise = np.transpose([volume_and_height(unit) - volume_and_height(-unit) for unit in np.eye(count)])
+    growth -= growth @ rise / max(rise @ rise, 1e-12) * rise
+    heavy = experiment.config.evaluation.betas * growth / max(np.linalg.norm(growth), 1e-12)
+    bodies = {"thin": -heavy, "mean": 0 * heavy, "heavy": heavy}
+    ranges = (cloth.mu_range, cloth.lam_range, cloth.bending_range)
+    middle = [np.sqrt(r.low * r.high) if r.log else 0.5 * (r.low + r.high) for r in ranges]
+    materials = {"soft": [r.low for r in ranges], "middling": middle, "stiff": [r.high for r in ranges]}
+    return {
+        f"{shape}, {name}": (
+            betas.astype(np.float32),
+            Material(*(jnp.float32(value) for value in (cloth.density, *values))),
+        )
+        for shape, betas in bodies.items()
+        for name, values in materials.items()
+    }
+
+
+def betas(config: Config) -> np.ndarray:
+    """The body shape that evaluation uses: drawn from its own seed, uniform in +-`evaluation.betas`."""
+    size = storage.load_body(config.body).shapedirs.shape[-1]
+    limit = config.evaluation.betas
+    return np.random.default_rng(config.evaluation.betas_seed).uniform(-limit, limit, size).astype(np.float32)

@@ -1,0 +1,113 @@
+"""The reference solver frame by frame: what the cloth would do, by the same energies that train the networks."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.body import skinning
+from clothjax.config import Config
+from clothjax.physics import solver
+from clothjax.physics.incremental_potential import TimeStep
+from clothjax.physics.solver import SolverInfo
+from clothjax.simulation import characters, time_step
+from clothjax.simulation.characters import Character, Window
+from clothjax.simulation.scene import Scene
+from clothjax.types import Array, ClothState, Pose
+
+
+class Problem(NamedTuple):
+    """One time step to solve. Positions are relative to the root at the current frame."""
+
+    step: TimeStep
+    skinned: Array  # [V, 3] m, plain skinning at the next frame
+    held: Array  # [V, 3] m, the canonical displacement kept
+    advance: Array  # [3] m, of the root
+
+
+def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, Pose], Problem]:
+    """A jitted function that states a time step.
+
+    Its arguments are the wearer, the garment [V, 3] m at the last frame and at this one, each relative to the root
+    then, and the three poses around the step.
+    """
+
+    @jax.jit
+    def state(character: Character, before: Array, now: Array, poses: Pose) -> Problem:
+        window = characters.window(scene, character, poses)
+        velocity = now - (before + poses.translation[0][None])
+        cloth = ClothState(now, velocity, jnp.zeros_like(now), *[jnp.zeros(0, now.dtype)] * 2)
+        step = time_step.time_step(scene, character, cloth, window, 1.0 / config.fps, config)
+        held = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
+        skinned = characters.skinned(character, window.following)
+        held = jnp.where(scene.garment.pinned[:, None], skinned, held)
+        return Problem(step, skinned, held, poses.translation[2])
+
+    return state
+
+
+def simulate(
+    scene: Scene,
+    character: Character,
+    poses: Pose,
+    config: Config,
+    *,
+    start: tuple[Array, Array] | None = None,
+    max_iterations: int = 500,
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[np.ndarray, list[SolverInfo]]:
+    """A motion, solved: the garment [T + 1, V, 3] m relative to the root at every frame, and how each solve ended.
+
+    A frame whose solve did not converge says so in its `SolverInfo`, and the next one goes on from what there is.
+
+    Args:
+        poses: windows [T, 3, ...] of `clips.poses`, one a frame.
+        start: the garment [V, 3] m at the frame before the first and at the first, each relative to its root. By
+            default it starts like Phi: skinned, then one long quasi-static step, whose info comes first.
+        max_iterations: of Newton's method, in a frame.
+        progress: called with the number of frames done.
+    """
+    garment, infos = scene.garment, []
+    state = problem(scene, config)
+
+    def solve(guess: Array, step: TimeStep) -> np.ndarray:
+        new, info = solver.solve_step(
+            guess, step, scene.mesh, garment.pinned, config.physics, max_iterations=max_iterations
+        )
+        infos.append(info)
+        return np.asarray(new, np.float32)
+
+    if start is None:
+        skinned, velocity, long = _quasi_static(scene, character, _at(poses, 0), config)
+        now = solve(skinned, long)
+        before = now - np.asarray(velocity) - np.asarray(poses.translation[0, 0])[None]
+    else:
+        before, now = (np.asarray(x, np.float32) for x in start)
+    trajectory = [now]
+    for frame in range(poses.translation.shape[0]):
+        step, _, held, advance = state(character, before, now, _at(poses, frame))
+        before, now = now, solve(held, step) - np.asarray(advance)[None]
+        trajectory.append(now)
+        progress(len(trajectory))
+    return np.stack(trajectory), infos
+
+
+def _quasi_static(scene: Scene, character: Character, poses: Pose, config: Config) -> tuple[Array, Array, TimeStep]:
+    """A garment as skinned on the standing body, the velocity it is given after that, and the long step it takes."""
+
+    @jax.jit
+    def state(poses: Pose):
+        window = characters.window(scene, character, poses)
+        cloth = time_step.start(character, window, 0)
+        still = Window(window.current, window.current, window.current)
+        resting = cloth._replace(velocity=jnp.zeros_like(cloth.velocity))
+        timestep = config.stage1.start_timestep or 1.0 / config.fps
+        return cloth.position, cloth.velocity, time_step.time_step(scene, character, resting, still, timestep, config)
+
+    return state(poses)
+
+
+def _at(poses: Pose, frame: int) -> Pose:
+    return Pose(poses.rotations[frame], poses.translation[frame])

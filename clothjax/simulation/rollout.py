@@ -1,0 +1,165 @@
+"""One frame of a garment that an animator moves, and rollouts: scans of frames with the losses accumulated inside."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from clothjax.body import motion_clips
+from clothjax.body.motion_clips import Clips
+from clothjax.config import Config
+from clothjax.physics import incremental_potential
+from clothjax.physics.incremental_potential import TimeStep
+from clothjax.simulation import characters
+from clothjax.simulation.characters import Character, Window
+from clothjax.simulation.scene import Scene
+from clothjax.simulation.time_step import start, time_step
+from clothjax.types import Array, ClothState, Pose
+
+
+class StepInput(NamedTuple):
+    """All that an animator may look at to move a garment by one frame."""
+
+    state: ClothState
+    poses: Pose  # three poses, leading axis 3
+    window: Window  # the character at these poses
+    time_step: TimeStep
+    potential: Callable[[Array], Array]  # of next positions [V, 3] m, in J
+
+
+class StepOutput(NamedTuple):
+    """Where an animator moves a garment."""
+
+    position: Array  # [V, 3] m, relative to the root at the current frame
+    code: Array  # [L] what the animator carries to the next frame
+    seen: Any = None  # pytree of features that its running statistics are to observe
+
+
+class Animator(NamedTuple):
+    """What moves one character's garment: a network, or the physics itself."""
+
+    memory_size: int  # L, numbers carried from frame to frame
+    step: Callable[[StepInput], StepOutput]
+    recurrent: bool = False  # whether gradients of the code reach back over all frames of a rollout
+
+
+class Taken(NamedTuple):
+    """A step that was taken, and what its potential was made of."""
+
+    position: Array  # [V, 3] m, relative to the root at the current frame
+    time_step: TimeStep
+    seen: Any
+
+
+class Track(NamedTuple):
+    """A rollout of T frames."""
+
+    position: Array  # [T, V, 3] m after each step, relative to the root before it
+    states: ClothState  # before each step, every leaf with a leading axis T
+    codes: Array  # [T, L] after each step
+
+
+def take(
+    animator: Animator,
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    poses: Pose,
+    timestep: Array,
+    config: Config,
+) -> tuple[ClothState, Taken]:
+    """Take one frame; the state returned is still relative to the current root."""
+    window = characters.window(scene, character, poses)
+    step = time_step(scene, character, state, window, timestep, config)
+
+    def potential(position: Array) -> Array:
+        return incremental_potential.potential(position, step, scene.mesh, config.physics)
+
+    position, code, seen = animator.step(StepInput(state, poses, window, step, potential))
+    velocity = position - state.position
+    taken = ClothState(position, velocity, velocity - state.velocity, code, code - state.latent)
+    return taken, Taken(position, step, seen)
+
+
+def follow(state: ClothState, advance: Array) -> ClothState:
+    """Express a state relative to the root of the next frame, which is `advance` [3] m further on."""
+    return state._replace(position=state.position - advance[None])
+
+
+def settle(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
+    """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
+    state = start(character, characters.window(scene, character, poses), animator.memory_size)
+    if config.stage1.start_timestep == 0:
+        return state
+    resting = state._replace(velocity=jnp.zeros_like(state.velocity))
+    standing = motion_clips.standing(poses)
+    settled, _ = take(animator, scene, character, resting, standing, config.stage1.start_timestep, config)
+    return settled._replace(velocity=state.velocity, acceleration=state.acceleration, change=state.change)
+
+
+def training_rollout(
+    animator: Animator,
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    clips: Clips,
+    frame: Array,
+    fresh: Array,
+    frames: int,
+    config: Config,
+    weigh: Callable[[dict[str, Array]], tuple[Array, dict[str, Array]]],
+) -> tuple[Array, tuple[ClothState, dict, Any]]:
+    """Mean loss over `frames` frames from a state, with the last state, mean energies in J, and all that was seen.
+
+    A `fresh` state takes the quasi-static step first: the body stands, the step is long, and what it started with as
+    velocity is given back after it. Gradients reach back over `config.stage1.gradient_frames` frames.
+
+    Args:
+        weigh: from the energies of a step in J to the loss, and the energies to report.
+    """
+
+    def body(carry, index):
+        state, frame, fresh = carry
+        cut = index % config.stage1.gradient_frames == 0
+        memory = state.latent
+        state = jax.tree.map(lambda x: jnp.where(cut, jax.lax.stop_gradient(x), x), state)
+        if animator.recurrent:
+            state = state._replace(latent=memory)
+        poses = motion_clips.poses(clips, frame)
+        still = motion_clips.standing(poses)
+        chosen = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), still, poses)
+        velocity = jnp.where(fresh, 0.0, state.velocity)
+        timestep = jnp.where(fresh, config.stage1.start_timestep, 1.0 / config.fps)
+        taken, (position, step, seen) = take(
+            animator, scene, character, state._replace(velocity=velocity), chosen, timestep, config
+        )
+        loss, terms = weigh(incremental_potential.energies(position, step, scene.mesh, config.physics))
+        taken = taken._replace(
+            velocity=jnp.where(fresh, state.velocity, taken.velocity),
+            acceleration=jnp.where(fresh, 0.0, taken.acceleration),
+            change=jnp.where(fresh, 0.0, taken.change),
+        )
+        taken = follow(taken, chosen.translation[2])
+        frame = jnp.where(fresh, frame, frame + 1)
+        return (taken, frame, jnp.zeros_like(fresh)), (loss, terms, seen)
+
+    (state, frame, fresh), (loss, terms, seen) = jax.lax.scan(body, (state, frame, fresh), jnp.arange(frames))
+    terms = {name: jnp.mean(value) for name, value in terms.items()}
+    return jnp.mean(loss), (jax.lax.stop_gradient(state), terms, jax.lax.stop_gradient(seen))
+
+
+def play(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> Track:
+    """An autoregressive rollout of an animator over a motion, from `settle` on.
+
+    Args:
+        poses: windows [T, 3, ...] of `motion_clips.poses`.
+    """
+    first = jax.tree.map(lambda x: x[0], poses)
+    state = settle(animator, scene, character, first, config)
+
+    def body(state, poses):
+        taken, (position, _, _) = take(animator, scene, character, state, poses, 1.0 / config.fps, config)
+        return follow(taken, poses.translation[2]), Track(position, state, taken.latent)
+
+    return jax.lax.scan(body, state, poses)[1]

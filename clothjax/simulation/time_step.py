@@ -1,0 +1,79 @@
+"""One time step stated: contact planes, masses, the potential to minimise."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from clothjax.config import Config
+from clothjax.material import configured_material
+from clothjax.physics import contact_search, incremental_potential
+from clothjax.physics.incremental_potential import TimeStep
+from clothjax.simulation import characters
+from clothjax.simulation.characters import Character, Window
+from clothjax.simulation.scene import Scene
+from clothjax.types import Array, ClothState
+
+
+def start(character: Character, window: Window, memory_size: int) -> ClothState:
+    """A garment as skinned at the current frame, moving with the body."""
+    now = characters.skinned(character, window.current)
+    return ClothState(
+        position=now,
+        velocity=now - characters.skinned(character, window.previous),
+        acceleration=jnp.zeros_like(now),
+        latent=jnp.zeros(memory_size, now.dtype),
+        change=jnp.zeros(memory_size, now.dtype),
+    )
+
+
+def time_step(
+    scene: Scene, character: Character, state: ClothState, window: Window, timestep: Array, config: Config
+) -> TimeStep:
+    """The incremental potential's constants for the step from `window.current` to `window.following`."""
+    physics = config.physics
+    body, body_next = window.current.body, window.following.body
+    ahead = state.position + state.velocity
+    planes = near = at_edges = on_self = None
+    if scene.touchable and physics.contact_surface == "triangles":
+        planes = contact_search.find(state.position, body, body_next, scene.patches, ahead)
+    elif scene.touchable:
+        planes = contact_search.find_at_centroids(state.position, body, body_next, scene.body.faces)
+    if planes is not None and "friction" not in physics.without:
+        near = incremental_potential.touching(state.position, planes, physics.friction_radius)
+    if planes is not None and physics.edge_contact:
+        at_edges = contact_search.find_at_edges(
+            state.position, planes, scene.mesh, body, body_next, scene.patches, ahead
+        )
+    if physics.self_contact:
+        on_self = contact_search.find_on_self(state.position, scene.garment_patches)
+    return TimeStep(
+        position=state.position,
+        velocity=state.velocity,
+        mass=character.mass,
+        rest=character.rest,
+        material=character.material,
+        contact=planes,
+        touching=near,
+        timestep=jnp.asarray(timestep, state.position.dtype),
+        edge_contact=at_edges,
+        self_contact=on_self,
+    )
+
+
+def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
+    """The potential of displacements [V, 3] m of the configured cloth, in the canonical pose and touching nothing."""
+    character = characters.dress(
+        scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
+    )
+    rest = character.template
+    step = TimeStep(
+        position=rest,
+        velocity=jnp.zeros_like(rest),
+        mass=character.mass,
+        rest=character.rest,
+        material=character.material,
+        contact=None,
+        touching=None,
+        timestep=jnp.float32(1.0 / config.fps),
+    )
+    return lambda displacement: incremental_potential.potential(rest + displacement, step, scene.mesh, config.physics)

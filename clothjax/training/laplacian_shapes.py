@@ -1,0 +1,77 @@
+"""Smooth blend shapes, and the network of springs that says how large a blend shape should be."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from clothjax.config import Config
+from clothjax.geometry import topology
+from clothjax.physics import energies
+from clothjax.simulation.scene import Scene
+
+MEMBRANE = 0.25 * energies.THICKNESS  # m, of the springs that stand for a membrane
+
+
+class Springs(NamedTuple):
+    """The rest shape as a network of springs: what a displacement costs, the same along x, y and z."""
+
+    free: np.ndarray  # [F] the vertices that are not pinned
+    stiffness: scipy.sparse.csc_array  # [F, F] N/m, its Laplacian
+    mass: np.ndarray  # [F] kg
+    timestep: float  # s
+
+    @property
+    def matrix(self) -> scipy.sparse.csc_array:
+        """Stiffness and inertia together, [F, F] N/m."""
+        return (self.stiffness + scipy.sparse.diags_array(self.mass / self.timestep**2)).tocsc()
+
+
+def springs(scene: Scene, config: Config) -> Springs:
+    """The spring network of the configured cloth."""
+    cloth, count = config.material, len(scene.garment.vertices)
+    edges = topology.edges(np.asarray(scene.garment.faces))
+    free = np.flatnonzero(~np.asarray(scene.garment.pinned))
+    stiffness = MEMBRANE * (2 * cloth.mu + cloth.lam)
+    ends = np.concatenate([edges, edges[:, ::-1]]).T
+    joined = scipy.sparse.coo_array((np.full(2 * len(edges), stiffness), ends), shape=(count, count))
+    laplacian = (scipy.sparse.diags_array(joined.sum(axis=1)) - joined).tocsc()[free][:, free]
+    with jax.ensure_compile_time_eval():
+        areas = np.asarray(energies.vertex_areas(jnp.asarray(scene.garment.vertices), scene.garment.faces), np.float64)
+    return Springs(free, laplacian, cloth.density * areas[free], 1.0 / config.fps)
+
+
+def laplacian(scene: Scene, config: Config) -> np.ndarray:
+    """Mass-scaled Laplacian eigenvectors, each along x, y and z: [K, V, 3] m.
+
+    Mode i is divided by sqrt(w_i + 1 / dt^2), so that a unit weight costs about the same energy in every mode. Pinned
+    vertices do not move.
+    """
+    count = config.model.blendshapes
+    free, stiffness, mass, timestep = springs(scene, config)
+    modes = min(-(-count // 3), len(free))
+    if modes < len(free) // 2:
+        values, vectors = scipy.sparse.linalg.eigsh(
+            stiffness,
+            modes,
+            scipy.sparse.diags_array(mass).tocsc(),
+            sigma=-1 / timestep**2,
+            v0=np.random.default_rng(0).standard_normal(len(free)),
+        )
+    else:
+        values, vectors = scipy.linalg.eigh(stiffness.toarray(), np.diag(mass), subset_by_index=[0, modes - 1])
+    scaled = vectors / np.sqrt(np.maximum(values, 0) + 1 / timestep**2)
+    basis = np.zeros((modes, 3, len(scene.garment.vertices), 3))
+    for axis in range(3):
+        basis[:, axis, free, axis] = scaled.T
+    return pad_basis(basis.reshape(-1, *basis.shape[2:])[:count], count)
+
+
+def pad_basis(basis: np.ndarray, count: int) -> np.ndarray:
+    """As many shapes as are wanted, where fewer can be had the others do nothing."""
+    missing = np.zeros((count - len(basis), *basis.shape[1:]))
+    return np.concatenate([basis, missing]).astype(np.float32)

@@ -1,0 +1,47 @@
+"""The pool of persistent simulations that training advances."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from clothjax.body import motion_clips
+from clothjax.body.motion_clips import Clips
+from clothjax.config import Config
+from clothjax.material import configured_material, sample_material
+from clothjax.networks import animators
+from clothjax.simulation import characters, time_step
+from clothjax.simulation.characters import Character
+from clothjax.simulation.scene import Scene
+from clothjax.types import Array, ClothState, Material
+
+
+class Simulation(NamedTuple):
+    """One character under way. In the pool every leaf has a leading axis."""
+
+    cloth: ClothState
+    betas: Array  # [S]
+    material: Material
+    frame: Array  # int32, of the clips
+    fresh: Array  # bool, before its quasi-static step
+
+
+def dressed(scene: Scene, betas: Array, material: Material, config: Config) -> Character:
+    """The character of a simulation; where all of them share a shape or a material, these are constants."""
+    fixed = config.stage1.betas == 0
+    cloth = material if config.material.sample else configured_material(config)
+    return characters.dress(scene, None if fixed else betas, cloth, config.physics)
+
+
+def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
+    """A new simulation: random clip and frame, betas and material, skinned."""
+    keys = jax.random.split(key, 3)
+    betas = jax.random.uniform(
+        keys[0], (scene.body.shapedirs.shape[-1],), minval=-config.stage1.betas, maxval=config.stage1.betas
+    )
+    material = sample_material(keys[1], config)
+    frame = motion_clips.draw(clips, jax.random.uniform(keys[2]))
+    character = dressed(scene, betas, material, config)
+    window = characters.window(scene, character, motion_clips.poses(clips, frame))
+    cloth = time_step.start(character, window, animators.memory_size(scene, config))
+    return Simulation(cloth, betas, material, frame, jnp.asarray(config.stage1.start_timestep > 0))

@@ -1,0 +1,113 @@
+"""Blend shapes to start training from: the principal components of cloth that only the physics moves."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jax.sharding import Mesh
+
+from clothjax.body import motion_clips, skinning
+from clothjax.body.motion_clips import Clips
+from clothjax.config import Config
+from clothjax.physics import descent
+from clothjax.simulation import characters, rollout
+from clothjax.simulation.rollout import Animator, StepInput, StepOutput
+from clothjax.simulation.scene import Scene
+from clothjax.training import laplacian_shapes, pool, sampling
+from clothjax.types import Array
+
+LARGEST = 12000  # vertices whose springs have an inverse that fits into memory
+BOUND = 1.0  # m, length of a step of all vertices together
+
+
+def principal(
+    scene: Scene,
+    clips: Clips,
+    config: Config,
+    progress: Callable[[int], None] = lambda done: None,
+    device_mesh: Mesh | None = None,
+) -> np.ndarray:
+    """Principal components [K, V, 3] m of `simulate`, as large as those of `blendshapes.laplacian`."""
+    frames = simulate(scene, clips, config, progress, device_mesh)
+    rows = frames.reshape(-1, frames[0, 0].size).astype(np.float64)
+    count = min(config.model.blendshapes, len(rows), rows.shape[1])
+    # of the smaller of the two products; the mean is one of the components
+    if len(rows) < rows.shape[1]:
+        vectors = scipy.linalg.eigh(rows @ rows.T, subset_by_index=[len(rows) - count, len(rows) - 1])[1]
+        shapes = vectors.T @ rows
+    else:
+        vectors = scipy.linalg.eigh(rows.T @ rows, subset_by_index=[rows.shape[1] - count, rows.shape[1] - 1])[1]
+        shapes = vectors.T
+    shapes = shapes[::-1].reshape(count, -1, 3)
+    network = laplacian_shapes.springs(scene, config)
+    moved = shapes[:, network.free]
+    cost = sum(np.einsum("kv,vk->k", moved[..., axis], network.matrix @ moved[..., axis].T) for axis in range(3))
+    return laplacian_shapes.pad_basis(shapes / np.sqrt(cost)[:, None, None], config.model.blendshapes)
+
+
+def simulate(
+    scene: Scene,
+    clips: Clips,
+    config: Config,
+    progress: Callable[[int], None] = lambda done: None,
+    device_mesh: Mesh | None = None,
+) -> np.ndarray:
+    """Canonical displacements [N, T, V, 3] m of cloth whose every vertex is free, in random closed loops.
+
+    Each step is a few conjugate-gradient steps down the same potential that trains Phi. Sequences that went wrong are
+    left out.
+
+    Raises:
+        ValueError: for a garment of too many vertices, or if all sequences went wrong.
+    """
+    settings, network = config.shapes, laplacian_shapes.springs(scene, config)
+    count = len(scene.garment.vertices)
+    if count > LARGEST:
+        raise ValueError(
+            f"principal shapes of a garment of {count} vertices need too much memory (the most is {LARGEST}): "
+            "set shapes.sequences: 0 for smooth ones"
+        )
+    inverse = np.zeros((count, count), np.float32)
+    inverse[np.ix_(network.free, network.free)] = np.linalg.inv(network.matrix.toarray())
+
+    def sequence(key: Array, clips: Clips, inverse: Array) -> Array:
+        simulation = pool.begin(key, scene, clips, config)
+        character = pool.dressed(scene, simulation.betas, simulation.material, config)
+
+        def precondition(gradient):
+            return jnp.matmul(inverse, gradient.reshape(-1, 3), precision="highest").reshape(-1)
+
+        def step(inputs: StepInput) -> StepOutput:
+            current, following = inputs.window.current.garment, inputs.window.following.garment
+
+            def garment(displacement):
+                return skinning.apply(following, character.template + displacement.reshape(-1, 3))
+
+            now = (skinning.unapply(current, inputs.state.position) - character.template).reshape(-1)
+            new = descent.descend(precondition, now, garment, inputs.potential, settings.descent_steps, BOUND)
+            return StepOutput(garment(new), inputs.state.latent)
+
+        poses = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
+        first = jax.tree.map(lambda x: x[0], poses)
+        animator = Animator(0, step)
+        state = rollout.settle(animator, scene, character, first, config)
+
+        def frame(state, poses):
+            taken, (new, _, _) = rollout.take(animator, scene, character, state, poses, 1.0 / config.fps, config)
+            transforms = characters.window(scene, character, poses).following.garment
+            displaced = skinning.unapply(transforms, new) - character.template
+            return rollout.follow(taken, poses.translation[2]), displaced
+
+        return jax.lax.scan(frame, state, poses)[1]
+
+    arguments = (jax.tree.map(jnp.asarray, clips), jnp.asarray(inverse))
+    found = sampling.sample(sequence, arguments, settings.sequences, settings.seed, progress, device_mesh)
+    good = np.abs(found).max(axis=(1, 2, 3)) < settings.farthest
+    if not good.any():
+        raise ValueError(
+            "all of the cloth that shapes should be taken from blew up or fell off: look at the garment on the body, "
+            "or set shapes.sequences: 0 for smooth ones"
+        )
+    return found[good]

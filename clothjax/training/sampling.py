@@ -1,0 +1,52 @@
+"""Many closed loops side by side, each of its own random clip, body and material."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from clothjax.training import devices
+
+ON_CPU, ELSEWHERE = 4, 64  # sequences in one program
+
+
+def sample(
+    sequence: Callable,
+    arguments: tuple,
+    count: int,
+    seed: int,
+    progress: Callable[[int], None] = lambda done: None,
+    device_mesh: Mesh | None = None,
+):
+    """`sequence(key, *arguments)` for `count` keys of a seed, stacked, on the host.
+
+    Args:
+        progress: called with the number of sequences done.
+        device_mesh: each device runs a part of them.
+    """
+    alone = device_mesh is None
+    on_cpu = jax.default_backend() == "cpu"
+    among = 1 if alone else device_mesh.size
+    size = among * min(ON_CPU if on_cpu else ELSEWHERE, -(-count // among))
+    arguments = devices.replicate(arguments, device_mesh)
+    keys = jax.random.split(jax.random.key(seed), count)
+
+    @partial(jax.jit, out_shardings=devices.replicated(device_mesh))
+    def run(keys, *arguments):
+        return devices.shard(jax.vmap(sequence, (0, *(None for _ in arguments))), device_mesh)(keys, *arguments)
+
+    def some(start: int):
+        rows = np.arange(start, start + size) % count
+        return jax.device_get(run(devices.replicate(keys[rows], device_mesh), *arguments))
+
+    parts = []
+    # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
+    with ThreadPoolExecutor(os.cpu_count() if on_cpu and alone else 1) as pool:
+        for part in pool.map(some, range(0, count, size)):
+            parts.append(part)
+            progress(min(len(parts) * size, count))
+    return jax.tree.map(lambda *each: np.concatenate(each)[:count], *parts)

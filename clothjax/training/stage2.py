@@ -1,0 +1,250 @@
+"""Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (21)."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from clothjax.body import motion_clips, skinning
+from clothjax.body.motion_clips import Clips
+from clothjax.config import Config, ModelConfig
+from clothjax.networks import animators, decoder, normalisation, psi
+from clothjax.networks.normalisation import Normalizers
+from clothjax.simulation import rollout
+from clothjax.simulation.scene import Scene
+from clothjax.training import devices, loop, pool, sampling
+from clothjax.training.loop import Weights
+from clothjax.types import Array, Pose
+
+ORDINARY = 10_000  # random frames that tell which pose inputs are ordinary
+
+
+class Teacher(NamedTuple):
+    """Rollouts of Phi: N sequences of T + 1 codes, and the inputs that lead from each to the next."""
+
+    latents: Array  # [N, T + 1, L]; the first is zero, as Psi's state is before its first frame
+    poses: Array  # [N, T, P]
+    constants: Array  # [N, C]
+
+
+class TrainingState(NamedTuple):
+    """All that stage 2 is at a step."""
+
+    step: Array  # int32
+    key: Array
+    params: dict
+    average: dict
+    optimizer: optax.OptState
+    normalizers: Normalizers
+    metric: Array  # [K, K] the mean squared vertex error of blend-weight errors, over the vertices' variance
+    garment: dict  # the frozen decoder and blend shapes: with them, a checkpoint is a whole Psi
+
+
+def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
+    """A function of a key, Phi (`params` and `statistics`) and clips: one rollout on a random clip, body and material.
+
+    Args:
+        kept: joints that are inputs.
+    """
+    stage = config.stage2
+
+    def sequence(key: Array, model: dict, clips: Clips) -> Teacher:
+        simulation = pool.begin(key, scene, clips, config)
+        character = pool.dressed(scene, simulation.betas, simulation.material, config)
+        poses = motion_clips.there_and_back(clips, simulation.frame, stage.frames)
+        animator = animators.phi_animator(model, scene, character, config)
+        latents = rollout.play(animator, scene, character, poses, config).codes
+
+        def inputs(poses: Pose):
+            return psi.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
+
+        constants = psi.constant_inputs(simulation.betas, simulation.material, config.material)
+        first = jnp.zeros_like(latents[:1])
+        return Teacher(jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants)
+
+    return sequence
+
+
+def blank(model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> Teacher:
+    """A rollout of NaN: what is needed of a teacher to read a training that is finished, and nothing to train on."""
+    shapes = jax.eval_shape(make_rollout(scene, kept, config), jax.random.key(0), model, clips)
+    return jax.tree.map(lambda part: np.full((1, *part.shape), np.nan, part.dtype), shapes)
+
+
+def teach(
+    model: dict,
+    scene: Scene,
+    clips: Clips,
+    kept: np.ndarray,
+    config: Config,
+    progress: Callable = lambda done: None,
+    device_mesh: Mesh | None = None,
+) -> tuple[Teacher, float]:
+    """Rolls Phi out on random clips, bodies and materials; also tells the seconds it took.
+
+    Args:
+        model: Phi's `params` and `statistics`.
+        kept: joints that are inputs.
+        progress: called with the number of sequences done.
+        device_mesh: each device rolls out a part of the sequences.
+    """
+    stage = config.stage2
+    began = time.monotonic()
+    sequence = make_rollout(scene, kept, config)
+    teacher = sampling.sample(sequence, (model, clips), stage.sequences, stage.seed + 1, progress, device_mesh)
+    good = np.isfinite(teacher.latents).all(axis=(1, 2))
+    if not good.any():
+        raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")
+    return Teacher(*(part[good] for part in teacher)), time.monotonic() - began
+
+
+def ordinary_poses(scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> np.ndarray:
+    """Inputs [n, P] of random frames and bodies of training, of which the teacher's few rollouts hold only a part."""
+    clips = jax.tree.map(jnp.asarray, clips)
+
+    def one(key):
+        keys = jax.random.split(key)
+        limit = config.stage1.betas
+        betas = jax.random.uniform(keys[0], (scene.body.shapedirs.shape[-1],), minval=-limit, maxval=limit)
+        poses = motion_clips.poses(clips, motion_clips.draw(clips, jax.random.uniform(keys[1])))
+        joints = skinning.shaped_joints(scene.body, betas)
+        return psi.window_inputs(poses, joints, scene.body.parents, kept, config.fps)
+
+    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(config.stage2.seed), ORDINARY)))
+
+
+def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray | None = None) -> TrainingState:
+    """The state before the first step, its normalizers measured on the teacher's rollouts and `ordinary`.
+
+    Args:
+        ordinary: more inputs [n, P], as of `ordinary_poses`.
+    """
+    key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
+    size = teacher.latents.shape[-1]
+    poses = np.asarray(teacher.poses).reshape(-1, teacher.poses.shape[-1])
+    if ordinary is not None:
+        poses = np.concatenate([poses, ordinary])
+    params = psi.init(model_key, size, teacher.poses.shape[-1], teacher.constants.shape[-1], config.stage2)
+    return TrainingState(
+        step=jnp.int32(0),
+        key=key,
+        params=params,
+        average=jax.tree.map(jnp.array, params),
+        optimizer=optimizer(config).init(params),
+        metric=vertex_metric(garment, teacher.latents[:, 1:].reshape(-1, size), config.model),
+        garment=jax.tree.map(jnp.array, garment),
+        normalizers=Normalizers(
+            latent=normalisation.measure(teacher.latents[:, 1:].reshape(-1, size)),
+            pose=normalisation.measure(poses),
+        ),
+    )
+
+
+def optimizer(config: Config) -> optax.GradientTransformation:
+    """Adam behind a clipped norm, at a cosine-decayed rate."""
+    stage = config.stage2
+    return optax.chain(
+        optax.clip_by_global_norm(stage.clip),
+        optax.adam(optax.cosine_decay_schedule(stage.learning_rate, stage.steps, alpha=0.01)),
+    )
+
+
+def vertex_metric(garment: dict, latents: np.ndarray, model: ModelConfig) -> Array:
+    """Matrix M [K, K] such that w^T M w is the mean squared displacement of vertices, as a share of its variance.
+
+    Args:
+        latents: [N, L] codes over which the variance is taken.
+    """
+    weights = jax.vmap(lambda z: decoder.blend_weights(garment, z, model))(jnp.asarray(latents))
+    shapes = garment["blendshapes"].reshape(garment["blendshapes"].shape[0], -1)
+    gram = shapes @ shapes.T
+    spread = weights - jnp.mean(weights, axis=0, keepdims=True)
+    return gram / jnp.mean(jnp.einsum("nk,kl,nl->n", spread, gram, spread))
+
+
+def rollout_loss(
+    params: dict,
+    state: TrainingState,
+    latents: Array,
+    poses: Array,
+    constants: Array,
+    key: Array,
+    config: Config,
+) -> Array:
+    """Mean squared error of one closed-loop rollout of the predictor `params`, as a share of the variance.
+
+    Z_t is perturbed, so that the predictor learns to come back: plain one-step regression diverges in closed loop.
+
+    Args:
+        state: for its normalizers, metric and decoder.
+        latents: [H + 1, L] teacher codes; poses: [H, P]; constants: [C]; key: of the noise.
+    """
+    stage, normalizers = config.stage2, state.normalizers
+    targets = jax.vmap(lambda z: normalisation.normalise(normalizers.latent, z))(latents)
+    poses = jax.vmap(lambda x: normalisation.normalise(normalizers.pose, x))(poses)
+    noise = stage.noise * jax.random.normal(key, targets[0].shape)
+
+    def weights(latent):
+        return decoder.blend_weights(state.garment, normalisation.denormalise(normalizers.latent, latent), config.model)
+
+    def body(latent, inputs):
+        pose, target = inputs
+        if stage.pushforward:
+            latent = jax.lax.stop_gradient(latent)
+        predicted = psi.predict(params, latent, pose, constants, stage.latent_decay)
+        error = jnp.mean((predicted - target) ** 2)
+        if stage.vertex_share > 0:
+            apart = weights(predicted) - weights(target)
+            error = (1 - stage.vertex_share) * error + stage.vertex_share * apart @ state.metric @ apart
+        return predicted, error
+
+    _, errors = jax.lax.scan(body, targets[0] + noise, (poses, targets[1:]))
+    return errors[-1] if stage.pushforward else jnp.mean(errors)
+
+
+def make_update(
+    teacher: Teacher, config: Config, steps: int, device_mesh: Mesh | None = None
+) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
+    """A jitted function that takes `steps` training steps, and their metrics [steps]; it consumes its argument.
+
+    A batch is spread over the devices.
+    """
+    stage = config.stage2
+    transform = optimizer(config)
+    sequences, frames = teacher.poses.shape[:2]
+
+    def loss(params, state, teacher, key):
+        keys = jax.random.split(key, 3)
+        which = jax.random.randint(keys[0], (stage.batch,), 0, sequences)
+        begin = jax.random.randint(keys[1], (stage.batch,), 0, frames - stage.rollout + 1)
+
+        def one(part, params, state, teacher):
+            sequence, begin, key = part
+            latents = jax.lax.dynamic_slice_in_dim(teacher.latents[sequence], begin, stage.rollout + 1)
+            poses = jax.lax.dynamic_slice_in_dim(teacher.poses[sequence], begin, stage.rollout)
+            constants = teacher.constants[sequence]
+            return rollout_loss(params, state, latents, poses, constants, key, config)
+
+        each = devices.shard(jax.vmap(one, (0, None, None, None)), device_mesh)
+        return jnp.mean(each((which, begin, jax.random.split(keys[2], stage.batch)), params, state, teacher))
+
+    def one(teacher: Teacher, state: TrainingState, _):
+        key = jax.random.fold_in(state.key, state.step)
+        value, gradient = jax.value_and_grad(loss)(state.params, state, teacher, key)
+        weights, metrics = loop.update_weights(
+            transform, Weights(state.params, state.average, state.optimizer), value, gradient, ema=0.99
+        )
+        return state._replace(step=state.step + 1, **weights._asdict()), metrics
+
+    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
+    def update(state, teacher):
+        return jax.lax.scan(partial(one, teacher), state, None, length=steps)
+
+    teacher = devices.replicate(teacher, device_mesh)
+    return lambda state: update(state, teacher)

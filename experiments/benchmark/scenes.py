@@ -1,0 +1,105 @@
+"""What a training step costs where the scene lacks something: what is absent is absent from the compiled program."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from clothjax.body import motion_clips
+from clothjax.config import Config, Ramp
+from clothjax.progress import progress_bar
+from clothjax.simulation import assembly, scene
+from clothjax.simulation.assembly import Experiment
+from clothjax.training import stage1
+from clothjax.types import Motion
+from experiments.benchmark import timing
+from experiments.benchmark.timing import cost, interleaved, program
+
+Change = Callable[[Experiment], Experiment]
+POLE = 0.05  # of the width, held by the pole
+
+
+def _configured(**parts: dict) -> Change:
+    """The same experiment with some settings of some parts of its configuration changed."""
+
+    def change(whole: Experiment) -> Experiment:
+        changed = {part: dataclasses.replace(getattr(whole.config, part), **new) for part, new in parts.items()}
+        return whole._replace(config=dataclasses.replace(whole.config, **changed))
+
+    return change
+
+
+def _pinned(held: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """The same experiment with those vertices [V, 3] m held."""
+
+    def change(whole: Experiment) -> Experiment:
+        return whole._replace(garment=whole.garment._replace(pinned=held(whole.garment.vertices)))
+
+    return change
+
+
+def _both(*changes: Change) -> Change:
+    def change(whole: Experiment) -> Experiment:
+        for one in changes:
+            whole = one(whole)
+        return whole
+
+    return change
+
+
+def _beside_a_pole(vertices: np.ndarray) -> np.ndarray:
+    return vertices[:, 0] < np.quantile(vertices[:, 0], POLE)
+
+
+def _waist(vertices: np.ndarray) -> np.ndarray:
+    return vertices[:, 1] > np.quantile(vertices[:, 1], 1 - POLE)
+
+
+SCENES: dict[str, Change] = {
+    "full": lambda whole: whole,
+    "flag_on_a_pole": _both(_configured(physics={"body": "none"}), _pinned(_beside_a_pole)),
+    "cloth_on_a_table": _configured(physics={"body": "still"}),
+    "pinned_skirt": _pinned(_waist),
+    "no_friction": _configured(physics={"without": ("friction",)}),
+    "no_bending": _configured(physics={"without": ("bending",)}),
+    "no_edge_contact": _configured(physics={"edge_contact": False}),
+    "bending_weight_zero": _configured(loss={"bending": Ramp(0.0)}),
+    "fixed_shape_and_material": _configured(stage1={"betas": 0.0}, material={"sample": False}),
+}
+
+
+def build(whole: Experiment, name: str) -> Experiment:
+    """One of `SCENES`, of the same garment."""
+    changed = SCENES[name](whole)
+    return changed._replace(scene=scene.build_scene(changed.garment, changed.body, changed.config))
+
+
+def update(whole: Experiment):
+    """A training step and the state it starts from."""
+    reel = _standing(whole) if whole.scene.still else assembly.training_clips(whole)[0]
+    return stage1.make_update(whole.scene, reel, whole.config, 1, 1), stage1.init(whole.scene, reel, whole.config)
+
+
+def _standing(whole: Experiment):
+    """A reel of one pose."""
+    names = assembly.training_motions(whole.config)
+    clip = assembly.motion(whole._replace(scene=whole.scene._replace(still=False)), names[0])
+    pose = Motion(np.repeat(clip.rotations[:1], 30, 0), np.repeat(clip.translation[:1], 30, 0), clip.fps)
+    return motion_clips.concatenate([pose], [""], [np.zeros(0, int)], 2)
+
+
+def measure(config: Config, rounds: int) -> dict:
+    """Flops, bytes and seconds of a training step in each scene, compiled without loops, and ratios to the full one."""
+    config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
+    whole = assembly.assemble(config)
+    programs = {}
+    with timing.unrolled(), progress_bar("compiling each scene", len(SCENES)) as report:
+        for name in SCENES:
+            programs[name] = program(*update(build(whole, name)))
+            report(len(programs))
+    seconds = interleaved(programs, rounds)
+    figures = {name: {**cost(one), "seconds": seconds[name]} for name, one in programs.items()}
+    return {
+        name: {**each, **{f"{key}_ratio": each[key] / figures["full"][key] for key in each}}
+        for name, each in figures.items()
+    }

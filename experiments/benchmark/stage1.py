@@ -1,0 +1,251 @@
+"""What a training step of Phi costs, part by part."""
+
+import dataclasses
+import tempfile
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.experimental.compilation_cache import compilation_cache
+
+from clothjax.body.motion_clips import Clips
+from clothjax.config import Config
+from clothjax.geometry import mesh_hierarchy
+from clothjax.networks import mesh_convolution, phi
+from clothjax.networks.mlp import Params
+from clothjax.physics import incremental_potential, solver
+from clothjax.progress import progress_bar
+from clothjax.simulation import assembly
+from clothjax.simulation.assembly import Experiment
+from clothjax.training import loop, stage1
+from experiments.benchmark import textbook, timing
+from experiments.benchmark.timing import against_peaks, cost, interleaved, program, temporary_bytes
+
+CONVOLUTION = (32, 64)  # channels at which the kernel of every vertex and neighbour fits into memory
+COMPILED_FRAMES = 3  # of the rollout whose compilation is timed
+BATCH = 4
+
+
+class Moment(NamedTuple):
+    """A training that begins: its state and clips, and the first step of its first simulation."""
+
+    state: stage1.TrainingState
+    clips: Clips
+    first: stage1.FirstStep
+
+
+def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
+    """All figures of a training step at a configuration whose body nodes take part in message passing.
+
+    Args:
+        compiling: measures too how long compilation takes.
+    """
+    whole = assembly.assemble(config)
+    moment = first_moment(whole)
+    report = {"vertices": len(whole.garment.vertices), "width": config.model.width}
+    parts = [lambda: processor(whole, moment, rounds), lambda: convolution(whole, rounds)]
+    parts += [lambda: compilation(whole)] * compiling + [lambda: step(whole, moment, rounds)]
+    with progress_bar("measuring", len(parts)) as done:
+        for index, part in enumerate(parts):
+            report |= part()
+            done(index + 1)
+    return report
+
+
+def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
+    """Encoder and processor, forward and backward, against the textbook's."""
+    config, state = whole.config, moment.state
+
+    def loss(form, model):
+        def total(params, statistics, seen):
+            return jnp.mean(form(params, statistics, whole.scene, seen, model) ** 2)
+
+        return jax.value_and_grad(total)
+
+    names = ("type_embedding", "level_embedding", "encoder", "processor")
+    params = {name: state.params[name] for name in names}
+    forms = {"ours": phi.pass_messages, "textbook": textbook.process}
+    arguments = (params, state.statistics, moment.first.seen)
+    kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
+    rounded = dataclasses.replace(recomputed, bfloat16=True)
+    programs = {
+        "ours": program(loss(forms["ours"], recomputed), *arguments),
+        "ours, products in bfloat16": program(loss(forms["ours"], rounded), *arguments),
+        "ours, nothing recomputed": program(loss(forms["ours"], kept), *arguments),
+        "textbook": program(loss(forms["textbook"], kept), *arguments),
+    }
+    seconds = interleaved(programs, rounds)
+    memory = {name: temporary_bytes(one) for name, one in programs.items()}
+
+    def difference():
+        ours, theirs = (
+            np.asarray(jax.jit(lambda p, s, x, form=form: form(p, s, whole.scene, x, config.model))(*arguments))
+            for form in forms.values()
+        )
+        return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
+
+    single = difference()
+    exact, low = (programs[name]()[1] for name in ("ours", "ours, products in bfloat16"))
+    with jax.enable_x64(True):
+        arguments = jax.tree.map(solver.to_float64, arguments)
+        double = difference()
+    return {
+        "processor_speedup": seconds["textbook"] / seconds["ours"],
+        "processor_memory_ratio": memory["ours"] / memory["textbook"],
+        "processor_error_float32": single,
+        "processor_error_float64": double,
+        "bfloat16_speedup": seconds["ours"] / seconds["ours, products in bfloat16"],
+        "bfloat16_gradient_error": _apart(low, exact),
+        "processor": {name: {"seconds": seconds[name], "temporary_mib": memory[name] / 2**20} for name in programs},
+    }
+
+
+def _apart(one: Params, other: Params) -> float:
+    """The norm of the difference of two gradients, over that of the second."""
+    difference = optax.tree.norm(jax.tree.map(jnp.subtract, one, other))
+    return float(difference / optax.tree.norm(other))
+
+
+def convolution(whole: Experiment, rounds: int) -> dict:
+    """The first block of the mesh convolution, forward and backward, against building every kernel."""
+    config = whole.config
+    level = config.model.convolution[0]
+    count = len(whole.garment.vertices)
+    table = mesh_hierarchy.hierarchy(whole.garment.faces, count, [level.stride], [level.radius])[0]
+    inputs, outputs = CONVOLUTION
+    keys = jax.random.split(jax.random.key(0))
+    params = mesh_convolution.init(keys[0], table, inputs, outputs, config.model.convolution_bases, 0.0)
+    x = jax.random.normal(keys[1], (count, inputs))
+
+    def ours(params, x):
+        return mesh_convolution.apply(params, x, table.ids, table.mask, residual_rate=0.0)
+
+    def explicit(params, x):
+        return textbook.convolve(params, x, table.ids, table.mask)
+
+    def loss(form):
+        return jax.value_and_grad(lambda params, x: jnp.mean(form(params, x) ** 2), (0, 1))
+
+    programs = {name: program(loss(form), params, x) for name, form in {"ours": ours, "explicit": explicit}.items()}
+    seconds = interleaved(programs, rounds)
+    error = np.abs(np.asarray(ours(params, x)) - np.asarray(explicit(params, x))).max()
+    return {
+        "mesh_convolution_speedup": seconds["explicit"] / seconds["ours"],
+        "mesh_convolution_error": float(error),
+        "mesh_convolution": {
+            name: {"seconds": seconds[name], "temporary_mib": temporary_bytes(one) / 2**20, **cost(one)}
+            for name, one in programs.items()
+        },
+    }
+
+
+def compilation(whole: Experiment) -> dict:
+    """Seconds until a training step on a rollout is traced and compiled: without, and with, a persistent cache."""
+    config = whole.config
+    reel, _ = assembly.training_clips(whole)
+    state = jax.eval_shape(lambda: stage1.init(whole.scene, reel, config))
+
+    def once() -> float:
+        jax.clear_caches()
+        began = time.perf_counter()
+        jax.jit(stage1.make_update(whole.scene, reel, config, COMPILED_FRAMES, 1)).lower(state).compile()
+        return time.perf_counter() - began
+
+    before = jax.config.jax_compilation_cache_dir
+    with tempfile.TemporaryDirectory() as folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        compilation_cache.reset_cache()
+        try:
+            return {"compile_seconds_cold": once(), "compile_seconds_cached": once()}
+        finally:
+            jax.config.update("jax_compilation_cache_dir", before)
+            compilation_cache.reset_cache()
+
+
+def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
+    """The training step and its pieces, beside the peaks of this machine; and a batch against single steps."""
+    config, scene = whole.config, whole.scene
+    several = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, batch=BATCH, pool=BATCH))
+    states = {"step": moment.state, "batch": stage1.init(scene, moment.clips, several)}
+    updates = {
+        name: stage1.make_update(scene, moment.clips, one, 1, 1)
+        for name, one in {"step": config, "batch": several}.items()
+    }
+    pieces = _pieces(whole, moment)
+    programs = {name: program(*piece) for name, piece in pieces.items()}
+    programs |= {name: program(update, states[name]) for name, update in updates.items()}
+    seconds = interleaved(programs, rounds)
+    best = timing.peaks(rounds)
+    # a loop would be counted once: without loops, and so without anything recomputed in them
+    plain = dataclasses.replace(config, model=dataclasses.replace(config.model, remat=False))
+    with timing.unrolled():
+        counted = {name: cost(program(*piece)) for name, piece in _pieces(whole._replace(config=plain), moment).items()}
+    return {
+        "step_seconds": seconds["step"],
+        "step_temporary_mib": temporary_bytes(programs["step"]) / 2**20,
+        "contact_share": seconds["body and contact"] / seconds["step"],
+        "batch4_per_window_ratio": seconds["batch"] / BATCH / seconds["step"],
+        "peaks": best,
+        "pieces": {
+            name: {
+                **against_peaks(seconds[name], counted[name], best),
+                "share": seconds[name] / seconds["step"],
+                "temporary_mib": temporary_bytes(programs[name]) / 2**20,
+            }
+            for name in pieces
+        },
+    }
+
+
+def _pieces(whole: Experiment, moment: Moment) -> dict:
+    """Functions, with their arguments, that together are most of a training step."""
+    config, scene = whole.config, whole.scene
+    params, statistics = moment.state.params, moment.state.statistics
+    simulation = jax.tree.map(lambda x: x[0], moment.state.pool)
+    cloth, (character, window, step, seen) = simulation.cloth, moment.first
+
+    def contact(simulation):
+        found = stage1.first_step(scene, simulation, moment.clips, config)
+        return found.step, found.seen.world
+
+    def passing(params, seen):
+        return jnp.mean(phi.pass_messages(params, statistics, scene, seen, config.model) ** 2)
+
+    def convolving(params, processed):
+        return jnp.mean(phi.convolve(params, scene, processed, config.model) ** 2)
+
+    def physics(params, latent, step):
+        new = phi.decode(params, scene, character, latent, window, config.model)
+        return incremental_potential.potential(new, step, scene.mesh, config.physics)
+
+    def descent(gradient, weights):
+        return loop.update_weights(stage1.optimizer(config), weights, jnp.float32(0.0), gradient, config.stage1.ema)
+
+    def gradient(function, *names):
+        chosen = {name: params[name] for name in params if name in names}
+        return jax.value_and_grad(function), chosen
+
+    processed = jnp.zeros((len(cloth.position), config.model.width))
+    weights = loop.Weights(moment.state.params, moment.state.average, moment.state.optimizer)
+    return {
+        "body and contact": (contact, simulation),
+        "encoder and processor": (
+            *gradient(passing, "type_embedding", "level_embedding", "encoder", "processor"),
+            seen,
+        ),
+        "mesh convolution": (*gradient(convolving, "convolution", "latent"), processed),
+        "decoder and physics": (*gradient(physics, "garment"), cloth.latent, step),
+        "optimiser": (descent, params, weights),
+    }
+
+
+def first_moment(whole: Experiment) -> Moment:
+    """The first moment of a training."""
+    clips = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
+    state = stage1.init(whole.scene, clips, whole.config)
+    simulation = jax.tree.map(lambda x: x[0], state.pool)
+    first = jax.jit(lambda one: stage1.first_step(whole.scene, one, clips, whole.config))(simulation)
+    return Moment(state, clips, first)

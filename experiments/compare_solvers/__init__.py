@@ -1,0 +1,1 @@
+"""The reference solver beside NVIDIA Newton's, step for step."""
