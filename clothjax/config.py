@@ -178,9 +178,6 @@ class ModelConfig:
     """Training steps over which the feature statistics are collected; then they are frozen."""
     remat: bool = False
     """Recompute each message-passing block in the backward pass: several times less memory, a little slower."""
-    bfloat16: bool = False
-    """Matrix products of encoding and message passing in bfloat16, where the device is faster at them: CPUs are not.
-    Parameters, and what passes from layer to layer, stay in float32."""
 
     def __post_init__(self):
         _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")

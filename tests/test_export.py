@@ -267,11 +267,14 @@ def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
     assert apart(stablehlo.run_stablehlo(path, model, motion), model, motion).max() < 2e-5
 
 
-def test_safetensors_hold_the_whole_model(model, motion, tmp_path):
+def test_safetensors_hold_the_whole_model(model, motion, tmp_path, monkeypatch):
     for each in (model, specialise.specialise(model, blendshapes=50)):
         path = safetensors.to_safetensors(each, tmp_path / "g.safetensors")
         again = safetensors.from_safetensors(path)
         np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(each, motion)[0])
+    with monkeypatch.context() as older, pytest.raises(ValueError, match=r"has format 1, .* reads up to 0; update it"):
+        older.setattr(safetensors, "FORMAT", 0)
+        safetensors.from_safetensors(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"g\.safetensors: not a whole model in safetensors .*convert it again"):
         safetensors.from_safetensors(path)

@@ -47,6 +47,16 @@ ASSETS = Path(__file__).parents[1] / "assets"
 FACTORS = (0.01, 100.0)  # of a region's cloth over the garment's
 
 
+class NewerFormat(ValueError):
+    """A file was written by a newer version of this library."""
+
+
+def refuse_newer(path: str | Path, version: int, known: int) -> None:
+    """Raises NewerFormat for a file of a format that is newer than the known one."""
+    if version > known:
+        raise NewerFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")
+
+
 # Names
 
 
