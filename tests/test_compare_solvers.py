@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from clothjax.physics import energies
+from clothjax.physics import energies, incremental_potential
 from experiments.compare_solvers import engines, report
 from experiments.compare_solvers.engines import CONFIG, MATERIAL, SCENES
 
@@ -76,11 +76,20 @@ def test_our_pins_carry_the_weight_at_rest():
     assert report.pins(scene, engine.position) == pytest.approx(1, abs=1e-5)
 
 
-def test_newtons_energies_are_put_back():
-    ours = energies.stretching, energies.collision
-    with engines.newtons_energies():
-        assert energies.stretching is engines.neo_hookean and energies.collision is engines.quadratic
-    assert (energies.stretching, energies.collision) == ours
+def test_laws_of_another_solver_replace_ours_in_that_call_only():
+    scene = engines.scene("hang", 4)
+
+    def stretching(laws):
+        engine = engines.Reference(scene, DT)
+        position = engine.position * np.array([1.1, 1.3, 0.9])
+        with jax.enable_x64(True):
+            terms = incremental_potential.energies(position, engine.time_step(), scene.mesh, engines.CONFIG, laws)
+        return float(terms["stretching"])
+
+    ours = stretching(incremental_potential.LAWS)
+    newtons = stretching(engines.NEWTONS_LAWS)
+    assert newtons > 0 and abs(newtons / ours - 1) > 1e-3
+    assert stretching(incremental_potential.LAWS) == ours
 
 
 def test_distances():
@@ -108,7 +117,7 @@ def test_ours_and_newtons_take_the_same_steps(name):
     pytest.importorskip("newton")
     scene = engines.scene(name, 8)
     newton = engines.Vbd(scene, DT, 100)
-    with engines.newtons_energies():
-        tracks, _ = report.simulate({"ours": engines.Reference(scene, DT), "newton": newton}, 4, 4)
+    ours = engines.Reference(scene, DT, laws=engines.NEWTONS_LAWS)
+    tracks, _ = report.simulate({"ours": ours, "newton": newton}, 4, 4)
     assert np.abs(tracks["ours"][-1] - scene.start).max() > 0.03
     assert report.distances(tracks["ours"], tracks["newton"])["max_mm"] < 0.05
