@@ -7,7 +7,6 @@ from typing import Literal
 import pytest
 
 from clothjax import config as config_module
-from clothjax.config import TuningConfig
 from clothjax.files import configuration
 
 
@@ -54,6 +53,9 @@ def write(folder, name, text):
 
 def load(folder, text, *overrides):
     return configuration.load(Config, write(folder, "c.yaml", text), overrides)
+
+
+SECTIONS = [cls for cls in vars(config_module).values() if hasattr(cls, "RETIRED")]
 
 
 def test_values_take_their_declared_type(tmp_path):
@@ -211,8 +213,13 @@ def test_the_vertices_that_a_stack_reaches(edges, level):
 
 
 @pytest.mark.parametrize(
-    "setting, said", [({"blendshape_rate": 0.1}, "stage1.blendshape_rate"), ({"start_timestep": 0.3}, "time step")]
+    "section, name, value",
+    [(cls, name, value) for cls in SECTIONS for name, value in cls.RETIRED.items()],
+    ids=lambda part: getattr(part, "__name__", str(part)),
 )
-def test_tuning_refuses_what_it_would_ignore(setting, said):
-    with pytest.raises(ValueError, match=said):
-        TuningConfig(steps=10, **setting)
+def test_a_retired_setting_is_read_with_its_last_value_and_refused_with_another(section, name, value):
+    old = 7.0 if value is config_module.ANYTHING else value
+    assert configuration.from_dict(section, {name: old}) == section()
+    if value is not config_module.ANYTHING:
+        with pytest.raises(ValueError, match=rf"runs/x: {name}: is no longer a setting, it is always"):
+            configuration.from_dict(section, {name: not value if isinstance(value, bool) else value + 1}, "runs/x")

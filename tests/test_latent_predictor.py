@@ -174,30 +174,18 @@ def test_trained_with_noise_it_follows_its_teacher_in_closed_loop():
     assert error < 0.35 * np.abs(unseen.latents[0, 1:]).mean()
 
 
-def test_pushforward_has_no_gradient_through_its_own_steps():
+def test_the_noise_on_the_first_code_is_felt_by_the_whole_rollout():
     teacher = _rotating_teacher(sequences=2, frames=8)
 
-    def gradient(pushforward, noise):
-        config = _config(pushforward=pushforward, noise=noise, rollout=3, hidden=(8,))
+    def gradient(noise):
+        config = _config(noise=noise, rollout=3, hidden=(8,))
         state = stage2.init(teacher, _garment(config), config)
         return jax.grad(stage2.rollout_loss)(
             state.params, state, jnp.asarray(teacher.latents[0, :4]), jnp.asarray(teacher.poses[0, :3]),
             jnp.zeros(3), jax.random.key(1), config,
         )["dense_0"]["kernel"]  # fmt: skip
 
-    config = _config(noise=0.0, rollout=3, hidden=(8,))
-    state = stage2.init(teacher, _garment(config), config)
-    codes, poses = jnp.asarray(teacher.latents[0, :4]), jnp.asarray(teacher.poses[0, :3])
-    code = normalisation.normalise(state.normalizers.latent, codes[0])
-    for pose in poses[:2]:
-        pose = normalisation.normalise(state.normalizers.pose, pose)
-        code = psi.predict(state.params, code, pose, jnp.zeros(3), config.stage2.latent_decay)
-    reached = normalisation.denormalise(state.normalizers.latent, code)
-    last = jax.grad(stage2.rollout_loss)(
-        state.params, state, jnp.stack([reached, codes[3]]), poses[2:], jnp.zeros(3), jax.random.key(1), config
-    )["dense_0"]["kernel"]  # fmt: skip
-    np.testing.assert_allclose(gradient(True, 0.0), last, rtol=1e-3, atol=1e-4 * float(jnp.abs(last).max()))
-    assert not np.allclose(gradient(False, 0.3), gradient(False, 0.0))
+    assert not np.allclose(gradient(0.3), gradient(0.0))
 
 
 def test_a_widened_range_holds_what_was_seen_since():

@@ -1,4 +1,4 @@
-"""The incremental potential of one time step: its terms, and their weighted sum (20)."""
+"""The incremental potential of one time step (METHOD.md, Incremental potential): its terms, and their weighted sum."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,6 +9,9 @@ from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search
 from clothjax.physics.energies import bending, collision, friction, gravity, inertia, stretching
 from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, SelfContact
+
+FRICTION_RADIUS = 3e-3  # m, a distance (HOOD compares its square with this)
+FRICTION_SMOOTHING = 1e-4  # m
 
 
 class TimeStep(NamedTuple):
@@ -36,9 +39,9 @@ class Laws(NamedTuple):
 LAWS = Laws()
 
 
-def touching(position: Array, contact: Contact, radius: float) -> Array:
-    """Whether each vertex [V, 3] m is within `radius` m of its contact plane."""
-    return contact_search.distance(position, contact.point, contact.normal) < radius
+def touching(position: Array, contact: Contact) -> Array:
+    """Return bool [V]: which vertices [V, 3] m are within `FRICTION_RADIUS` of their contact planes."""
+    return contact_search.distance(position, contact.point, contact.normal) < FRICTION_RADIUS
 
 
 def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS) -> dict[str, Array]:
@@ -69,7 +72,7 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws
             step.mass,
             step.touching,
             config.friction_coefficient,
-            config.friction_smoothing,
+            FRICTION_SMOOTHING,
         )
     if step.edge_contact is not None:
         terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config, laws)
@@ -101,5 +104,5 @@ def energies(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws
 
 
 def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
-    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises (11)."""
+    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises."""
     return sum(energies(new, step, mesh, config).values())

@@ -92,7 +92,7 @@ def solve_step(
     max_iterations: int = 500,
     laws: Laws = LAWS,
 ) -> tuple[np.ndarray, SolverInfo]:
-    """The positions that minimise `incremental_potential.potential` over the vertices that are not pinned (11).
+    """The positions that minimise `incremental_potential.potential` over the vertices that are not pinned.
 
     Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned
     by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The
