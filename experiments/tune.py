@@ -22,8 +22,7 @@ from clothjax.files import configuration
 from clothjax.networks import normalisation, psi
 from clothjax.runtime import trained
 from clothjax.simulation import assembly
-from clothjax.training import stage2
-from clothjax.training.pipeline import fine_tune
+from clothjax.training import pipeline, stage2
 
 
 def main(argv: list[str]) -> None:
@@ -42,7 +41,8 @@ def main(argv: list[str]) -> None:
     kept = psi.input_joints(whole.names, config.stage2)
     seen = stage2.ordinary_poses(whole.scene, reel, kept, config)
     normalizers = normalizers._replace(pose=normalisation.widened(normalizers.pose, seen))
-    tuned = fine_tune(whole, reel, phi["params"], garment, predictor, normalizers, given.out)
+    run = pipeline.Run(whole, given.out, reel, None)
+    tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(garment, predictor, normalizers))
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
     made = trained.made(folder)
     command = shlex.join(["python", "-m", "experiments.tune", *argv])

@@ -27,7 +27,7 @@ def from_axis_angle(vector: Array) -> Array:
 
 
 def to_6d(matrix: Array) -> Array:
-    """The first two columns of rotation matrices [..., 3, 3] as [..., 6] (3); Zhou et al. 2019."""
+    """The first two columns of rotation matrices [..., 3, 3] as [..., 6]; Zhou et al. 2019."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 

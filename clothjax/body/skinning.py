@@ -15,12 +15,12 @@ def shaped_joints(body: Body, betas: Array) -> Array:
 
 
 def shaped_vertices(wearable: Body | Garment, betas: Array) -> Array:
-    """Vertices T + G_S(beta) [N, 3] m of a body or garment of shape `betas` [S], in the canonical pose."""
+    """Vertices [N, 3] m plus shape blend shapes, of a body or garment of shape `betas` [S], in the canonical pose."""
     return wearable.vertices + jnp.einsum("ncs,s->nc", wearable.shapedirs, betas, precision=HIGHEST)
 
 
 def forward_kinematics(rotations: Array, joints: Array, parents: np.ndarray) -> tuple[Array, Array]:
-    """Global rotations [J, 3, 3] and positions [J, 3] m of the joints, the root at its canonical place (2).
+    """Global rotations [J, 3, 3] and positions [J, 3] m of the joints, the root at its canonical place.
 
     Args:
         rotations: [J, 3, 3] local to the parent.
@@ -43,18 +43,18 @@ def forward_kinematics(rotations: Array, joints: Array, parents: np.ndarray) -> 
 
 
 def joint_transforms(rotations: Array, joints: Array, parents: np.ndarray) -> Array:
-    """L_k of (2) as [J, 3, 4]: forward kinematics after the inverse bind matrices (translations in m)."""
+    """Transforms [R_j | q_j - R_j J_j] as [J, 3, 4]: forward kinematics after the inverse bind matrices (m)."""
     return bound_transforms(*forward_kinematics(rotations, joints, parents), joints)
 
 
 def bound_transforms(turn: Array, position: Array, joints: Array) -> Array:
-    """L_k of (2) as [J, 3, 4] from global rotations [J, 3, 3] and positions [J, 3] m, and canonical joints [J, 3] m."""
+    """`joint_transforms` from global rotations R [J, 3, 3], positions q [J, 3] m and canonical joints J [J, 3] m."""
     offset = position - jnp.einsum("jab,jb->ja", turn, joints, precision=HIGHEST)
     return jnp.concatenate([turn, offset[:, :, None]], axis=-1)
 
 
 def blend(weights: Array, transforms: Array) -> Array:
-    """Per-vertex transforms [N, 3, 4], the weighted sum of (1), from weights [N, J] and transforms [J, 3, 4]."""
+    """Per-vertex transforms sum_j w_ij T_j [N, 3, 4], from weights w [N, J] and transforms T [J, 3, 4]."""
     flat = jnp.matmul(weights, transforms.reshape(transforms.shape[0], 12), precision=HIGHEST)
     return flat.reshape(weights.shape[0], 3, 4)
 

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import yaml
 
+from clothjax.config import ANYTHING
+
 Config = TypeVar("Config")
 Sources = dict[str, tuple[str, ...]]  # dotted path of a value -> the files that set it or parts of it
 
@@ -165,6 +167,11 @@ def _build(cls: type, values: Any, path: str, sources: Sources, default: str) ->
     if not isinstance(values, Mapping):
         _fail(f"expected a mapping of settings, got {values!r}", path, sources, default)
     fields = {f.name: f for f in dataclasses.fields(cls)}
+    retired = getattr(cls, "RETIRED", {})
+    for key in set(values) & set(retired):
+        if retired[key] is not ANYTHING and values[key] != retired[key]:
+            _fail(f"is no longer a setting, it is always {retired[key]!r}", _join(path, key), sources, default)
+    values = {key: value for key, value in values.items() if key not in retired}
     for key in values:
         if key not in fields:
             near = difflib.get_close_matches(str(key), fields, 1)

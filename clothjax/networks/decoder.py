@@ -1,4 +1,4 @@
-"""From a latent code to vertices: decoder, learnable blend shapes, skinning (17)-(19). Shared by Phi and Psi."""
+"""From a latent code to vertices (METHOD.md, Decoder): decoder, blend shapes, skinning. Shared by Phi and Psi."""
 
 import flax.linen as nn
 import jax
@@ -30,7 +30,7 @@ class Decoder(nn.Module):
             self.skip = self.param("skip", lambda key, *shape: jnp.eye(*shape), self.latent, config.blendshapes)
 
     def __call__(self, latent: Array, free: Array) -> Array:
-        """Canonical displacement [V, 3] m of a latent code [L] (19); zero where `free` [V] is zero (pins)."""
+        """Canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is zero (pins)."""
         shapes = self.blendshapes
         flat = jnp.matmul(
             self.blend_weights(latent), shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST
@@ -58,5 +58,5 @@ def of(params: Params, config: ModelConfig) -> Decoder:
 
 
 def vertices(displaced: Array, template: Array, transforms: Array) -> Array:
-    """Garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4] (17)."""
+    """Garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4]."""
     return skinning.apply(transforms, template + displaced)

@@ -82,13 +82,12 @@ class Convolution(nn.Module):
 
     features: tuple[int, ...]  # of each block
     bases: int
-    residual_rate: float = 0.5
 
     @nn.compact
     def __call__(self, x: Array, tables: Sequence[Table]) -> Array:
         """Features [P, O] of the last block of x [N, I]; each block has its own table."""
         for index, (features, table) in enumerate(zip(self.features, tables, strict=True)):
-            x = MeshConvolution(features, self.bases, self.residual_rate, name=str(index))(x, table)
+            x = MeshConvolution(features, self.bases, name=str(index))(x, table)
         return x
 
 

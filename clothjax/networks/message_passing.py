@@ -85,19 +85,19 @@ class Block(nn.Module):
         everything = checkpoint_name(jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1), ARRIVED)
         return Latents(nodes + self._updated(nodes, everything, self.rows), new_body, new_edges, new_pairs), None
 
+    @nn.nowrap
     def _reached(self, rows: Array) -> Array:
         return rows if self.rows is None else rows[self.rows]
 
-    def _tail(self, mlp: MLP, first: Array) -> Array:
-        return mlp.tail_in_chunks(first) if self.in_chunks else mlp.tail(first)
-
+    @nn.nowrap
     def _updated(self, nodes: Array, arrived: Array, rows: np.ndarray | None) -> Array:
         """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
         first = self.node.dense[0]
         own = first.product(nodes) + first.bias[None]
         added = first.product(arrived, begin=first.inputs - arrived.shape[-1])
-        return self._tail(self.node, own + added if rows is None else own.at[rows].add(added))
+        return self.node.tail(own + added if rows is None else own.at[rows].add(added), self.in_chunks)
 
+    @nn.nowrap
     def _message(self, name: str, targets, sources, latent, target_index, source_index) -> Array:
         """MLP([target, source, edge]) with the node parts of its first layer multiplied before the gather."""
         mlp, width = self.edge[name], self.width
@@ -105,7 +105,7 @@ class Block(nn.Module):
         target, source = first.product(targets), first.product(sources, begin=width)
         target = target if target_index is None else target[target_index]
         source = source if source_index is None else source[source_index]
-        return self._tail(mlp, target + source + first.product(latent, begin=2 * width) + first.bias[None])
+        return mlp.tail(target + source + first.product(latent, begin=2 * width) + first.bias[None], self.in_chunks)
 
 
 class Processor(nn.Module):

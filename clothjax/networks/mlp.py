@@ -67,17 +67,21 @@ class MLP(nn.Module):
         """[N, outputs] of x [N, inputs]; without a LayerNorm, [..., outputs] of [..., inputs]."""
         return self.tail(self.dense[0](x))
 
-    def tail(self, first: Array) -> Array:
-        """The outputs from the pre-activation [N, W] of the first layer."""
+    def tail(self, first: Array, in_chunks: bool = False) -> Array:
+        """The outputs from the pre-activation [N, W] of the first layer.
+
+        Args:
+            in_chunks: some rows at a time, and nothing but `first` is kept for the backward pass.
+        """
+        if in_chunks and not self.is_initializing():
+            return self._in_chunks(first)
         x = first
         for layer in self.dense[1:]:
             x = layer(nn.relu(x))
         return self.layer_norm(x) if self.norm else x
 
-    def tail_in_chunks(self, first: Array) -> Array:
-        """As `tail`, some rows at a time, and nothing but `first` is kept for the backward pass."""
-        if self.is_initializing():
-            return self.tail(first)
+    @nn.nowrap
+    def _in_chunks(self, first: Array) -> Array:
         count, width = first.shape
         chunks = -(-count // CHUNK)
         rows = -(-count // chunks)

@@ -1,4 +1,4 @@
-"""Phi: Encode, Process, Convolve, Decode (18). From a garment's state to the latent code of its next frame."""
+"""Phi (METHOD.md, Phi): encode, process, convolve, decode. From a garment's state to the code of its next frame."""
 
 from dataclasses import field
 
@@ -20,6 +20,8 @@ from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.rollout import StepInput, StepOutput
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array
+
+DESCENT_BOUND = 0.3  # of a step of the descent, in Z
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
@@ -46,7 +48,7 @@ class Phi(nn.Module):
         self.message_passing = MessagePassing(config, scene.graph, scene.level, pinned, self.block)
         nn.share_scope(self, self.message_passing)  # its parameters are beside the others, as in older models
         features = tuple(level.features or channels for level in config.convolution)
-        self.convolution = Convolution(features, config.convolution_bases, config.residual_rate)
+        self.convolution = Convolution(features, config.convolution_bases)
         if config.convolution[-1].features is not None:
             # a change of the code starts small, a code starts at unit size
             self.latent = Dense(features[-1], channels, 1e-4 if config.latent_update == "descent" else 1.0)
@@ -109,7 +111,7 @@ def step(
             return jnp.matmul(fixed["inverse_hessian"], gradient, precision="highest")
 
         start = warm_start(now, change, garment, potential)
-        guess = descend(precondition, start, garment, potential, config.descent_steps, config.descent_bound)
+        guess = descend(precondition, start, garment, potential, config.descent_steps, DESCENT_BOUND)
         guessed = garment(guess)
     else:
         guess = 0.0

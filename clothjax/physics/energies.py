@@ -111,7 +111,7 @@ def gravity(height: Array, mass: Array) -> Array:
 
 
 def inertia(deviation: Array, mass: Array, timestep: Array) -> Array:
-    """Incremental kinetic potential [V] J (16): m |x - x_t - v_t|^2 / (2 dt^2) of the deviation, m."""
+    """Incremental kinetic potential [V] J: m |x - x_t - v_t|^2 / (2 dt^2) of the deviation x - x_t - v_t, m."""
     return mass * jnp.sum(deviation * deviation, axis=-1) / (2.0 * timestep * timestep)
 
 

@@ -1,4 +1,4 @@
-"""Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
+"""Psi in use (METHOD.md, Psi): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
 
 A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
 the range that they had in training, and a pose that is not finite, or no pose at all, is taken to be the last one:

@@ -36,12 +36,12 @@ from clothjax.render.ray_cast import SKIN, Surface
 from experiments.compare_solvers.engines import (
     CONFIG,
     COUNT,
+    NEWTONS_LAWS,
     SCENES,
     SPHERE,
     Reference,
     Scene,
     Vbd,
-    newtons_energies,
     scene,
 )
 
@@ -119,21 +119,20 @@ def compare(
                 "pins": {"ours": pins(scenes[name], last["ours"])},
             }
             done += frames
-        with newtons_energies():
-            for name, n in jobs:
-                engines = {
-                    "same energies": Reference(scenes[name], 1.0 / (FPS * n)),
-                    "disturbed": Reference(scenes[name], 1.0 / (FPS * n), DISTURBANCE),
-                }
-                more, _ = simulate(engines, frames, n, lambda frame, done=done: report(done + frame))
-                track, done = tracks[name, n] | more, done + frames
-                measured[name, n]["converged"] &= all(engine.converged for engine in engines.values())
-                measured[name, n]["pins"]["newton"] = pins(scenes[name], track["newton"][-1])
-                measured[name, n]["distance"] = {
-                    "material": distances(track["ours"], track["newton"]),
-                    "solver": distances(track["same energies"], track["newton"]),
-                    "chance": distances(track["same energies"], track["disturbed"]),
-                }
+        for name, n in jobs:
+            engines = {
+                "same energies": Reference(scenes[name], 1.0 / (FPS * n), laws=NEWTONS_LAWS),
+                "disturbed": Reference(scenes[name], 1.0 / (FPS * n), DISTURBANCE, NEWTONS_LAWS),
+            }
+            more, _ = simulate(engines, frames, n, lambda frame, done=done: report(done + frame))
+            track, done = tracks[name, n] | more, done + frames
+            measured[name, n]["converged"] &= all(engine.converged for engine in engines.values())
+            measured[name, n]["pins"]["newton"] = pins(scenes[name], track["newton"][-1])
+            measured[name, n]["distance"] = {
+                "material": distances(track["ours"], track["newton"]),
+                "solver": distances(track["same energies"], track["newton"]),
+                "chance": distances(track["same energies"], track["disturbed"]),
+            }
     return {f"{name} 1/{FPS * n} s": result for (name, n), result in measured.items()}, tracks
 
 
