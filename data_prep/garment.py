@@ -23,9 +23,10 @@ from scipy.spatial import ConvexHull
 from clothjax.cli import fail_clearly
 from clothjax.config import HANDS
 from clothjax.files.storage import joint_names, load_body, save_garment
+from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
 from data_prep.dressing import ARM, FOREARM, WINDING, clear_vertices, dress, highest_opening, limbs, push_out
-from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
+from data_prep.mesh import clip, component
 from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
 from data_prep.user_mesh import FEWEST, MOST, Answers, Unit, Up, bring, draw
@@ -117,7 +118,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
 
     shape, faces, _ = resample(solid, triangles, vertices)
     shape, faces = _fit(shape, faces, wearer.vertices, wearer.faces)
-    if len(boundary_loops(faces)) != kind.loops or components(faces, len(shape)).max() > 0:
+    if len(boundary_loops(faces)) != kind.loops or components(len(shape), faces).max() > 0:
         raise ValueError(
             f"template {template!r} came out with {len(boundary_loops(faces))} openings, not {kind.loops}, "
             "on this body: try another pose, or bring a mesh (--mesh)"

@@ -12,10 +12,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from clothjax.files.storage import FACTORS
+from clothjax.geometry.topology import boundary_loops, components
 from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
 from data_prep.dressing import FOREARM, WINDING, dress, highest_opening, limbs, push_out
-from data_prep.mesh import boundary_loops, compact, components, edge_table
+from data_prep.mesh import compact, edge_table
 from data_prep.remesh import resample
 
 Unit = Literal["m", "cm", "mm", "in", "ft"]
@@ -87,7 +88,7 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     if answers.pin == "highest" and not openings:
         raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
     pinned = highest_opening(points, faces) if answers.pin == "highest" else marked
-    parts = 1 + int(components(faces, len(points)).max())
+    parts = 1 + int(components(len(points), faces).max())
     said.append(
         f"{len(points)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, {openings} openings, "
         f"{int(pinned.sum())} vertices pinned"
@@ -180,7 +181,7 @@ def _clean(path, points: np.ndarray, faces: np.ndarray, said: list[str]) -> tupl
     """The mesh without double vertices and faces without area, and for each vertex of the file which one it is now, -1
     for none."""
     near = cKDTree(points).query_pairs(WELD, output_type="ndarray")
-    _, first, index = np.unique(components(near, len(points)), return_index=True, return_inverse=True)
+    _, first, index = np.unique(components(len(points), near), return_index=True, return_inverse=True)
     if len(first) < len(points):
         said.append(f"welded: {len(points) - len(first)} vertices lay on others")
     points, faces = points[first], index[faces]

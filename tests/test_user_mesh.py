@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from clothjax.files import storage
+from clothjax.geometry.topology import boundary_mask
 from data_prep import dressing, garment, user_mesh
-from data_prep.mesh import boundary_mask
 from data_prep.user_mesh import Answers, bring
 
 
