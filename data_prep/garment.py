@@ -20,13 +20,13 @@ import tyro
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import ConvexHull
 
-from clothjax.cli import fail_clearly
 from clothjax.config import HANDS
-from clothjax.files.storage import joint_names, load_body, save_garment
+from clothjax.files.storage import load_rig, save_garment
 from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
 from data_prep.dressing import ARM, FOREARM, WINDING, clear_vertices, dress, highest_opening, limbs, push_out
 from data_prep.mesh import clip, component
+from data_prep.program import run
 from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
 from data_prep.user_mesh import FEWEST, MOST, Answers, Unit, Up, bring, draw
@@ -299,7 +299,7 @@ def main(args: Arguments) -> None:
     unread = [name for name in Answers._fields if getattr(answers, name) != getattr(of_mesh, name)]
     if args.mesh is None and unread:
         raise ValueError(f"--{unread[0]} says something of a mesh: give --mesh")
-    body, names = load_body(args.body), joint_names(args.body)
+    body, names = load_rig(args.body)
     if args.mesh is None:
         count = args.vertices or 1000
         garment = build(args.template, count, body, names, args.seed)
@@ -322,5 +322,4 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

@@ -9,13 +9,14 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+import tyro
 from scipy.spatial.transform import Rotation
 
 from clothjax.body import plausibility, skinning
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.types import Body
-from data_prep import anny, asf_amc, bvh, garment, mesh, procedural, retarget
+from data_prep import amass, anny, asf_amc, bvh, garment, mesh, procedural, program, retarget, smpl
 from data_prep.diffusion import diffuse
 from data_prep.dressing import WINDING
 from data_prep.remesh import remesh
@@ -32,6 +33,29 @@ def body():
 @pytest.fixture(scope="module")
 def names():
     return storage.joint_names("body")
+
+
+# Command lines
+
+
+@pytest.mark.parametrize("module", [amass, anny, asf_amc, bvh, garment, procedural, smpl])
+def test_help_shows_an_example_that_can_be_parsed(module, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [module.__file__, "--help"])
+    with pytest.raises(SystemExit) as end:
+        program.run(module.main, module.Arguments, module.__doc__)
+    shown = capsys.readouterr().out
+    examples = [line.split() for line in shown.splitlines() if line.startswith(f"    python -m {module.__name__} ")]
+    assert end.value.code == 0 and examples and f"usage: python -m {module.__name__}" in shown
+    for example in examples:
+        assert isinstance(tyro.cli(module.Arguments, args=example[3:]), module.Arguments)
+
+
+def test_underscores_in_an_option_get_its_new_name(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["bvh.py", "a.bvh", "a_b.h5", "--drop_clavicles=3"])
+    with pytest.raises(SystemExit) as end:
+        program.run(bvh.main, bvh.Arguments, bvh.__doc__)
+    assert end.value.code == 1
+    assert capsys.readouterr().err.startswith("error: --drop_clavicles: write --drop-clavicles;")
 
 
 # Generated motions
