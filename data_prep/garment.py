@@ -29,7 +29,7 @@ from data_prep.mesh import clip, component
 from data_prep.program import run
 from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
-from data_prep.user_mesh import FEWEST, MOST, Answers, Unit, Up, bring, draw
+from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, Unit, Up, bring, draw
 
 OFFSET = 0.012  # m, of the solid from the body
 CELL = 0.008  # m, of the distance field's grid
@@ -292,8 +292,8 @@ def main(args: Arguments) -> None:
     """
     if (args.mesh is None) == (args.template is None):
         raise ValueError("give either --template or --mesh")
-    if args.vertices is not None and not FEWEST <= args.vertices <= MOST:
-        raise ValueError(f"--vertices {args.vertices}: {FEWEST} to {MOST} can be trained")
+    if args.vertices is not None and not MIN_VERTICES <= args.vertices <= MAX_VERTICES:
+        raise ValueError(f"--vertices {args.vertices}: {MIN_VERTICES} to {MAX_VERTICES} can be trained")
     answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth)
     of_mesh = Answers(vertices=args.vertices, seed=args.seed)
     unread = [name for name in Answers._fields if getattr(answers, name) != getattr(of_mesh, name)]
