@@ -14,10 +14,9 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
-from clothjax.files.storage import UNREADABLE, canonical_rotation, joint_names, load_body, save_motion
+from clothjax.files.storage import UNREADABLE, Rig, canonical_rotation, load_rig
 from clothjax.types import Motion
-from data_prep.repair import Bad, mend
+from data_prep.program import MotionOptions, run, write_motion
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
 from data_prep.smpl import BODY
 
@@ -62,65 +61,59 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
     return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, fps.item())
 
 
-def carry(
+def retarget_amass(
     capture: Capture, body_file: str | Path, *, fps: float = 30.0, leg: float = 0.8, freeze: bool = True
-) -> tuple[Motion, tuple[str, ...]]:
-    """A recording on the joints of a body file, starting above the origin and standing on y = 0; and their names.
+) -> tuple[Motion, Rig]:
+    """Retarget a recording onto the body in a file, starting above the origin and standing on y = 0.
 
     Args:
-        leg: length of a leg, hip to ankle, of who was recorded, m: the path is scaled to the body's.
+        capture: the recording, from `read_amass`.
+        body_file: file of the body (or embedded), with CMU's or SMPL's joint names.
+        fps: frames per second of the result.
+        leg: m, from hip to ankle of the recorded person; the path is scaled to the body's leg.
         freeze: keep toes and wrists as in the canonical pose.
+
+    Returns:
+        The motion, and the body with its joint names.
 
     Raises:
         ValueError: for a body without the joints, or a recording of fewer than two frames.
     """
-    capture = resample(capture, fps)
-    body, names = load_body(body_file), joint_names(body_file)
-    known = cmu_names(names)
+    capture, rig = resample(capture, fps), load_rig(body_file)
+    names = cmu_names(rig.names)
     local = {
         name: capture.rotations[:, i]
         for i, name in enumerate(capture.names)
         if not (freeze and any(part in name for part in FROZEN))
     }
-    lacking = sorted(set(local) - set(known))
+    lacking = sorted(set(local) - set(names))
     if lacking:
         raise ValueError(f"{body_file} has no joint {', '.join(lacking)}: name its joints as CMU's or SMPL's")
-    rotations = from_t_pose(local, body, known, canonical_rotation(body_file))
-    scale = leg_length({name: body.joints[i] for i, name in enumerate(known)}) / leg
+    rotations = from_t_pose(local, rig.body, names, canonical_rotation(body_file))
+    scale = leg_length({name: rig.body.joints[i] for i, name in enumerate(names)}) / leg
     path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale
-    return stand(Motion(rotations.astype(np.float32), path, fps), body), names
+    return stand(Motion(rotations.astype(np.float32), path, fps), rig.body), rig
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """A motion of AMASS as a motion file."""
+class Arguments(MotionOptions):
+    """Retarget a motion of AMASS onto a body."""
 
     motion: tyro.conf.Positional[Path]
     """.npz as published."""
     output: tyro.conf.Positional[Path]
-    body: str = "body"
-    """The body to carry it over to, by asset name or path."""
-    fps: float = 30.0
     up: Literal["y", "z"] = "z"
+    """Axis of the file that points up."""
     leg: float = 0.8
-    """Length of a leg of who was recorded, hip to ankle, m."""
-    freeze: bool = True
-    """Keep wrists and toes still."""
-    bad: Bad = "keep"
-    """What becomes of frames in which no body could have moved so: `keep`, `repair` by interpolation, or `drop` all but
-    the longest stretch without any."""
-    licence: str = "of the recording"
+    """Length of the recorded person's leg, hip to ankle, m."""
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for, and says which frames are implausible."""
-    motion, names = carry(read_amass(args.motion, args.up), args.body, fps=args.fps, leg=args.leg, freeze=args.freeze)
-    name = args.motion.name.partition(".")[0]
-    motion, said = mend(motion, load_body(args.body), args.bad)
-    save_motion(args.output, motion, names, name=name, source=args.motion.name, licence=args.licence)
-    print(f"{args.output}: {len(motion.translation)} frames, {said}")
+    """Write the motion file, and print which frames are implausible."""
+    capture = read_amass(args.motion, args.up)
+    motion, rig = retarget_amass(capture, args.body, fps=args.fps, leg=args.leg, freeze=args.freeze)
+    write_motion(args.output, motion, rig, args.motion, args)
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

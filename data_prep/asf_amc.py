@@ -6,7 +6,7 @@ Plain or .gz. Each joint sits where its bone begins. CMU's data (mocap.cs.cmu.ed
 NSF EIA-0196217) is free to use with credit, and not to be resold.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,9 +14,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
-from clothjax.files.storage import joint_names, load_body, save_motion
-from data_prep.repair import Bad, mend
+from clothjax.files.storage import load_rig
+from data_prep.program import MotionOptions, run, write_motion
 from data_prep.retarget import Capture, numbers, read_lines, retarget
 
 CMU_NAMES = {
@@ -178,47 +177,31 @@ def _check_frame(path: str | Path, line: int, values: dict[str, list], frames: i
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """Retargets an ASF/AMC recording onto a body."""
+class Arguments(MotionOptions):
+    """Retarget an ASF/AMC recording onto a body."""
 
     skeleton: tyro.conf.Positional[Path]
     motion: tyro.conf.Positional[Path]
     output: tyro.conf.Positional[Path]
-    body: str = "body"
-    """File of the body, or the name of the embedded one."""
-    fps: float = 30.0
     source_fps: float = 120.0
+    """Frames per second of the recording; the file does not say."""
     abduct: float = 25.0
     """Degrees the upper arms are taken outward: CMU's skeletons hold them about 30 too close to the trunk."""
     drop_clavicles: float = 15.0
     """Degrees the clavicles are lowered, for the same reason."""
-    freeze: bool = True
-    """Keep hands, fingers and toes still."""
-    bad: Bad = "keep"
-    """What becomes of frames in which no body could have moved so: `keep`, `repair` by interpolation, or `drop` all but
-    the longest stretch without any."""
+    licence: str = field(
+        default="of the recording; CMU's: free to use with credit, not to be resold (mocap.cs.cmu.edu)", kw_only=True
+    )
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for, and says which frames are implausible."""
-    body, names = load_body(args.body), joint_names(args.body)
-    capture = read_amc(args.motion, read_asf(args.skeleton), args.source_fps)
+    """Write the motion file, and print which frames are implausible."""
+    rig, capture = load_rig(args.body), read_amc(args.motion, read_asf(args.skeleton), args.source_fps)
     motion = retarget(
-        capture,
-        body,
-        names,
-        fps=args.fps,
-        abduct=args.abduct,
-        drop_clavicles=args.drop_clavicles,
-        freeze=args.freeze,
+        capture, *rig, fps=args.fps, abduct=args.abduct, drop_clavicles=args.drop_clavicles, freeze=args.freeze
     )
-    licence = "of the recording; CMU's: free to use with credit, not to be resold (mocap.cs.cmu.edu)"
-    name = args.motion.name.partition(".")[0]
-    motion, said = mend(motion, body, args.bad)
-    save_motion(args.output, motion, names, name=name, source=str(args.motion.name), licence=licence)
-    print(f"{args.output}: {len(motion.translation)} frames, {said}")
+    write_motion(args.output, motion, rig, args.motion, args)
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

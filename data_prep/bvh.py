@@ -13,9 +13,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
-from clothjax.files.storage import joint_names, load_body, save_motion
-from data_prep.repair import Bad, mend
+from clothjax.files.storage import load_rig
+from data_prep.program import MotionOptions, run, write_motion
 from data_prep.retarget import Capture, cmu_names, numbers, read_lines, retarget
 
 DAZ_NAMES = {"hip": "Hips", "abdomen": "LowerBack", "chest": "Spine1", "neck": "Neck", "head": "Head"}
@@ -125,48 +124,28 @@ def _channels(path: str | Path, line: int, words: list[str]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """Retargets a BVH recording onto a body."""
+class Arguments(MotionOptions):
+    """Retarget a BVH recording onto a body."""
 
     motion: tyro.conf.Positional[Path]
     output: tyro.conf.Positional[Path]
-    body: str = "body"
-    """File of the body, or the name of the embedded one."""
-    fps: float = 30.0
     skip: int = 0
     """Frames left out at the start: in many files the first is an added T-pose."""
     abduct: float = 0.0
     """Degrees the upper arms are taken outward; 25 for CMU's recordings (see data_prep.asf_amc)."""
     drop_clavicles: float = 0.0
     """Degrees the clavicles are lowered; 15 for CMU's recordings."""
-    freeze: bool = True
-    """Keep hands, fingers and toes still."""
-    bad: Bad = "keep"
-    """What becomes of frames in which no body could have moved so: `keep`, `repair` by interpolation, or `drop` all but
-    the longest stretch without any."""
-    licence: str = "of the recording"
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for, and says which frames are implausible."""
-    body, names = load_body(args.body), joint_names(args.body)
-    capture = read_bvh(args.motion)
+    """Write the motion file, and print which frames are implausible."""
+    rig, capture = load_rig(args.body), read_bvh(args.motion)
     capture = capture._replace(rotations=capture.rotations[args.skip :], translation=capture.translation[args.skip :])
     motion = retarget(
-        capture,
-        body,
-        names,
-        fps=args.fps,
-        abduct=args.abduct,
-        drop_clavicles=args.drop_clavicles,
-        freeze=args.freeze,
+        capture, *rig, fps=args.fps, abduct=args.abduct, drop_clavicles=args.drop_clavicles, freeze=args.freeze
     )
-    name = args.motion.name.partition(".")[0]
-    motion, said = mend(motion, body, args.bad)
-    save_motion(args.output, motion, names, name=name, source=args.motion.name, licence=args.licence)
-    print(f"{args.output}: {len(motion.translation)} frames, {said}")
+    write_motion(args.output, motion, rig, args.motion, args)
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

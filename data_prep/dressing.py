@@ -4,9 +4,9 @@ import igl
 import numpy as np
 
 from clothjax.config import HANDS
+from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body, Garment
 from data_prep.diffusion import diffuse
-from data_prep.mesh import boundary_loops
 from data_prep.retarget import cmu_names
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER

@@ -20,15 +20,16 @@ import tyro
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import ConvexHull
 
-from clothjax.cli import fail_clearly
 from clothjax.config import HANDS
-from clothjax.files.storage import joint_names, load_body, save_garment
+from clothjax.files.storage import load_rig, save_garment
+from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
 from data_prep.dressing import ARM, FOREARM, WINDING, clear_vertices, dress, highest_opening, limbs, push_out
-from data_prep.mesh import boundary_loops, boundary_mask, clip, component, components
+from data_prep.mesh import clip, component
+from data_prep.program import run
 from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
-from data_prep.user_mesh import FEWEST, MOST, Answers, Unit, Up, bring, draw
+from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, Unit, Up, bring, draw
 
 OFFSET = 0.012  # m, of the solid from the body
 CELL = 0.008  # m, of the distance field's grid
@@ -117,7 +118,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
 
     shape, faces, _ = resample(solid, triangles, vertices)
     shape, faces = _fit(shape, faces, wearer.vertices, wearer.faces)
-    if len(boundary_loops(faces)) != kind.loops or components(faces, len(shape)).max() > 0:
+    if len(boundary_loops(faces)) != kind.loops or components(len(shape), faces).max() > 0:
         raise ValueError(
             f"template {template!r} came out with {len(boundary_loops(faces))} openings, not {kind.loops}, "
             "on this body: try another pose, or bring a mesh (--mesh)"
@@ -291,14 +292,14 @@ def main(args: Arguments) -> None:
     """
     if (args.mesh is None) == (args.template is None):
         raise ValueError("give either --template or --mesh")
-    if args.vertices is not None and not FEWEST <= args.vertices <= MOST:
-        raise ValueError(f"--vertices {args.vertices}: {FEWEST} to {MOST} can be trained")
+    if args.vertices is not None and not MIN_VERTICES <= args.vertices <= MAX_VERTICES:
+        raise ValueError(f"--vertices {args.vertices}: {MIN_VERTICES} to {MAX_VERTICES} can be trained")
     answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth)
     of_mesh = Answers(vertices=args.vertices, seed=args.seed)
     unread = [name for name in Answers._fields if getattr(answers, name) != getattr(of_mesh, name)]
     if args.mesh is None and unread:
         raise ValueError(f"--{unread[0]} says something of a mesh: give --mesh")
-    body, names = load_body(args.body), joint_names(args.body)
+    body, names = load_rig(args.body)
     if args.mesh is None:
         count = args.vertices or 1000
         garment = build(args.template, count, body, names, args.seed)
@@ -321,5 +322,4 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

@@ -1,8 +1,8 @@
-"""Plain operations on triangle meshes: edges, boundary, connected parts, cutting."""
+"""Plain operations on triangle meshes: edges, connected parts, cutting."""
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+
+from clothjax.geometry.topology import components
 
 
 def edge_table(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -13,32 +13,9 @@ def edge_table(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.stack([code // size, code % size], axis=1), of_face.reshape(-1, 3), count
 
 
-def boundary_mask(faces: np.ndarray, count: int) -> np.ndarray:
-    """Whether each of `count` vertices is on the boundary."""
-    edges, _, sharing = edge_table(faces)
-    mask = np.zeros(count, bool)
-    mask[edges[sharing == 1].ravel()] = True
-    return mask
-
-
-def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """The vertices of each opening."""
-    edges, _, count = edge_table(faces)
-    border = edges[count == 1]
-    label = components(border, int(faces.max()) + 1)
-    used = np.unique(border)
-    return [used[label[used] == k] for k in np.unique(label[used])]
-
-
-def components(links: np.ndarray, count: int) -> np.ndarray:
-    """Label [count] of the connected part each vertex is in, from faces or edges."""
-    a, b = links[:, :-1].ravel(), links[:, 1:].ravel()
-    return connected_components(coo_matrix((np.ones(len(a)), (a, b)), (count, count)), directed=False)[1]
-
-
 def component(vertices: np.ndarray, faces: np.ndarray, near: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The connected part with most faces, or the one with the vertex nearest to a point [3]."""
-    label = components(faces, len(vertices))
+    label = components(len(vertices), faces)
     wanted = np.bincount(label[faces[:, 0]]).argmax()
     if near is not None:
         used = np.unique(faces)

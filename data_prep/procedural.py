@@ -16,9 +16,9 @@ import tyro
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
-from clothjax.files.storage import canonical_rotation, joint_names, load_body, save_motion
+from clothjax.files.storage import canonical_rotation, joint_names, load_rig, save_motion
 from clothjax.types import Motion
+from data_prep.program import run
 from data_prep.retarget import cmu_names, from_t_pose, stand
 
 # cycles per second, before a seed's own factor
@@ -75,10 +75,8 @@ def generate(kind: str, seed: int = 0, seconds: float = 8.0, fps: float = 30.0, 
     if not fps > 0 or not seconds * fps >= 2:
         raise ValueError(f"a clip of {seconds} s at {fps} fps has fewer than three frames: make it longer")
     pattern = _pattern(kind, seed, seconds, fps)
-    names = joint_names(body)
     standing = canonical_rotation(body)
-    body = load_body(body)
-
+    body, names = load_rig(body)
     local = {names[_find(names, j)]: _matrices(angles) for j, angles in pattern.angles.items()}
     rotations = from_t_pose(local, body, names, standing)
     motion = Motion(rotations.astype(np.float32), pattern.root - body.joints[0], fps)
@@ -234,5 +232,4 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

@@ -6,7 +6,8 @@ Boundary vertices slide along the boundary's own polyline, the others on the inp
 import igl
 import numpy as np
 
-from data_prep.mesh import boundary_mask, compact, edge_table
+from clothjax.geometry.topology import boundary_mask
+from data_prep.mesh import compact, edge_table
 
 
 def remesh(

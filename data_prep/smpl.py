@@ -17,9 +17,9 @@ import numpy as np
 import scipy.sparse
 import tyro
 
-from clothjax.cli import fail_clearly
 from clothjax.files.storage import UNREADABLE, save_body
 from clothjax.types import Body
+from data_prep.program import run
 
 BODY = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
@@ -190,5 +190,4 @@ def main(args: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    with fail_clearly():
-        main(tyro.cli(Arguments))
+    run(main, Arguments, __doc__)

@@ -1,6 +1,7 @@
-"""A garment from a mesh that somebody modelled around a body: checked, welded, put into metres, pushed out of the body.
+"""A garment from a mesh that was modelled around a body: checked, welded, put into metres, pushed out of the body.
 
-What can be decided is done and reported; what would be a guess is refused, with the flag that answers it.
+Repairs that have one right answer are made and logged. A mesh that would need a guess is refused, and the message
+names the option that answers it.
 """
 
 from pathlib import Path
@@ -12,28 +13,30 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from clothjax.files.storage import FACTORS
+from clothjax.geometry.topology import boundary_loops, components
 from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
 from data_prep.dressing import FOREARM, WINDING, dress, highest_opening, limbs, push_out
-from data_prep.mesh import boundary_loops, compact, components, edge_table
+from data_prep.mesh import compact, edge_table
 from data_prep.remesh import resample
 
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 Up = Literal["y", "z"]
+Surface = tuple[np.ndarray, np.ndarray]  # the body's vertices [B, 3] m float64 and faces [F, 3] int64
 UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-TURNS = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}  # to +Y up
-WELD = 1e-4  # m, vertices closer than this are one
-NEAR = 0.25  # m, a garment's mean distance to the body is less ...
-INSIDE = 10  # ... and counts so many times more where it is inside
-LOOSE = 0.03  # m, the median distance from which a garment counts as loose
-DEEP, MANY = 0.03, 0.15  # m inside the body, and the share of vertices so deep that the garment is another body's
-FEWEST, MOST = 100, 20_000  # vertices
-PINNED = (0.85, 0.1, 0.1)
-SAMPLES = 500  # of the diffusion onto loose garments
+TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+WELD_DISTANCE = 1e-4  # m; closer vertices become one
+MAX_MEAN_DISTANCE = 0.25  # m, from the body, of a garment that is around it
+INSIDE_PENALTY = 10  # weight of the depth inside the body over the distance to it, in comparing units
+LOOSE_DISTANCE = 0.03  # m; a garment with a larger median distance to the body counts as loose
+DEEP, MAX_DEEP_SHARE = 0.03, 0.15  # m inside the body; a larger share of such vertices means another body
+MIN_VERTICES, MAX_VERTICES = 100, 20_000
+DIFFUSION_SAMPLES = 500  # for each vertex of a loose garment
+PIN_COLOUR = (0.85, 0.1, 0.1)
 
 
 class Answers(NamedTuple):
-    """What only the user knows."""
+    """Answers that only the user knows."""
 
     units: Unit = "m"
     up: Up = "y"
@@ -42,7 +45,7 @@ class Answers(NamedTuple):
     loose: bool | None = None  # None: by its distance to the body
     flip: bool = False  # the side that faces the body is the outside
     seed: int = 0
-    cloth: tuple[str, ...] = ()  # WHAT=DENSITY,STRETCHING,BENDING; what, as of `pin`: red, or object:NAME
+    cloth: tuple[str, ...] = ()  # WHAT=DENSITY,STRETCHING,BENDING with WHAT red or object:NAME
 
 
 class Mesh(NamedTuple):
@@ -54,54 +57,70 @@ class Mesh(NamedTuple):
     objects: dict[str, np.ndarray]  # by name, [V] bool
 
 
-def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers) -> tuple[Garment, list[str]]:
-    """The garment, and lines that say what was done to the mesh; `names` are those of the body's joints.
+class Working(NamedTuple):
+    """The garment between two steps of `bring`."""
+
+    vertices: np.ndarray  # [V, 3] m, +Y up
+    faces: np.ndarray  # [F, 3]
+    pinned: np.ndarray  # [V] bool
+    cloth: np.ndarray | None = None  # [V, 3] factors of density, stretching and bending
+    log: tuple[str, ...] = ()  # a line for each change
+
+    def logged(self, line: str) -> "Working":
+        """Return the same garment with one more line in its log."""
+        return self._replace(log=(*self.log, line))
+
+
+def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers) -> tuple[Garment, tuple[str, ...]]:
+    """Make a garment from a mesh file.
+
+    Args:
+        path: of the mesh.
+        body: that the mesh was modelled around.
+        names: of the body's joints.
+        answers: of the user.
+
+    Returns:
+        The garment, and a log of the changes, one line each.
 
     Raises:
         ValueError: naming the file, the place in it, and what to do.
     """
-    mesh, said = read(path), []
+    mesh = read(path)
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
     _check_place(path, mesh.vertices, surface, answers)
-    points = UNITS[answers.units] * mesh.vertices @ TURNS[answers.up].T
-    points, faces, now = _clean(path, points, mesh.faces, said)
-    marked = np.isin(np.arange(len(points)), now[_marked(path, mesh, answers.pin, "--pin")])
-    cloth = _cloth(path, mesh, answers.cloth, now, len(points), said)
-    faces = _oriented(path, points, faces, surface, answers.flip, said)
+    working, index = _clean(path, UNITS[answers.units] * mesh.vertices @ TO_Y_UP[answers.up].T, mesh.faces)
+    working = _pin_marked(path, working, mesh, index, answers.pin)
+    working = _assign_cloth(path, working, mesh, index, answers.cloth)
+    working = _orient(path, working, surface, answers.flip)
     if answers.vertices:
-        before = points
-        points, faces, marked = _resampled(points, faces, marked, answers.vertices, said)
-        cloth = None if cloth is None else cloth[cKDTree(before).query(points)[1]]
-    if not FEWEST <= len(points) <= MOST:
+        working = _resample(working, answers.vertices)
+    if not MIN_VERTICES <= len(working.vertices) <= MAX_VERTICES:
         raise ValueError(
-            f"{path}: {len(points)} vertices; {FEWEST} to {MOST} can be trained: give --vertices for another number"
+            f"{path}: {len(working.vertices)} vertices; {MIN_VERTICES} to {MAX_VERTICES} can be trained: "
+            "give --vertices for another number"
         )
-    points = _pushed_out(path, points, faces, surface, said)
-    distance = np.abs(igl.signed_distance(points, *surface, sign_type=WINDING)[0])
-    loose = bool(np.median(distance) > LOOSE) if answers.loose is None else answers.loose
-    said.append(
-        f"{'loose' if loose else 'tight'}: {1e3 * np.median(distance):.0f} mm from the body in the middle, so skin and "
+    working = _push_out(path, working, surface)
+    distance = float(np.median(np.abs(igl.signed_distance(working.vertices, *surface, sign_type=WINDING)[0])))
+    loose = distance > LOOSE_DISTANCE if answers.loose is None else answers.loose
+    working = working.logged(
+        f"{'loose' if loose else 'tight'}: {1e3 * distance:.0f} mm from the body in the middle, so skin and "
         f"shape are those of the body {'around' if loose else 'nearest to'} each vertex"
     )
-    openings = len(boundary_loops(faces))
-    if answers.pin == "highest" and not openings:
-        raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
-    pinned = highest_opening(points, faces) if answers.pin == "highest" else marked
-    parts = 1 + int(components(faces, len(points)).max())
-    said.append(
-        f"{len(points)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, {openings} openings, "
-        f"{int(pinned.sum())} vertices pinned"
-    )
-    hidden = _bare(points, body, names)
-    garment = dress(points, faces, body, hidden, pinned, SAMPLES if loose else 0, answers.seed)
-    return garment._replace(cloth=cloth), said
+    if answers.pin == "highest":
+        working = _pin_highest_opening(path, working)
+    working = _log_counts(working)
+    vertices, faces, pinned, cloth, log = working
+    hidden = _uncovered_arms(vertices, body, names)
+    samples = DIFFUSION_SAMPLES if loose else 0
+    return dress(vertices, faces, body, hidden, pinned, samples, answers.seed)._replace(cloth=cloth), log
 
 
 def read(path: str | Path) -> Mesh:
-    """A mesh file (.obj, .ply, .off, .stl, .glb), all of its objects in one.
+    """Read a mesh file (.obj, .ply, .off, .stl, .glb), with all of its objects in one mesh.
 
     Raises:
-        ValueError: if it is not one, has no triangles, or a vertex that is not finite.
+        ValueError: if it is no mesh, has no triangles, or has a vertex that is not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -133,86 +152,96 @@ def read(path: str | Path) -> Mesh:
 
 
 def _brief(error: Exception) -> str:
+    """Return the first line of an error, shortened."""
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
 def _red(part: trimesh.Trimesh) -> np.ndarray:
+    """Return which vertices [V] bool are painted red."""
     if part.visual.kind != "vertex":
         return np.zeros(len(part.vertices), bool)
     red, green, blue = np.asarray(part.visual.vertex_colors)[:, :3].astype(int).T
     return (red > 150) & (green < 100) & (blue < 100)
 
 
-def _check_place(path, vertices: np.ndarray, surface, answers: Answers) -> None:
-    """Refuses a mesh that is not around the body as the user says it is, and says how it would be."""
+def _check_place(path: str | Path, vertices: np.ndarray, surface: Surface, answers: Answers) -> None:
+    """Refuse a mesh that is not around the body in the user's units and axis, and name those in which it is."""
+    height = np.ptp(surface[0][:, 1])
 
-    def away(units: str, up: str) -> tuple[float, float]:
-        """Mean distance to the body in m, and the same with more for what is inside; infinite where the mesh is far
-        larger or smaller."""
-        points = UNITS[units] * vertices @ TURNS[up].T
-        height = np.ptp(surface[0][:, 1])
+    def distances(units: str, up: str) -> tuple[float, float]:
+        """Return the mean distance to the body [m], without and with a penalty for the inside.
+
+        Both are infinite for a mesh far larger or smaller than the body.
+        """
+        points = UNITS[units] * vertices @ TO_Y_UP[up].T
         smallest = 0.05 if (units, up) == (answers.units, answers.up) else 0.15
         if not smallest * height < np.ptp(points, axis=0).max() < 1.5 * height:
             return np.inf, np.inf
-        few = points[:: max(1, len(points) // 500)]
-        signed = igl.signed_distance(few, *surface, sign_type=WINDING)[0]
+        sample = points[:: max(1, len(points) // 500)]
+        signed = igl.signed_distance(sample, *surface, sign_type=WINDING)[0]
         distance = np.mean(np.abs(signed))
-        return float(distance), float(distance + INSIDE * np.mean(np.maximum(-signed, 0.0)))
+        return float(distance), float(distance + INSIDE_PENALTY * np.mean(np.maximum(-signed, 0.0)))
 
-    found = {(units, up): away(units, up) for units in UNITS for up in TURNS}
-    near = {how: worn for how, (distance, worn) in found.items() if distance < NEAR}
-    told = near.get((answers.units, answers.up), np.inf)
-    if told < np.inf and told <= 2 * min(near.values()) + 0.01:
+    by_placement = {(units, up): distances(units, up) for units in UNITS for up in TO_Y_UP}
+    near = {key: penalised for key, (distance, penalised) in by_placement.items() if distance < MAX_MEAN_DISTANCE}
+    answered = near.get((answers.units, answers.up), np.inf)
+    if answered < np.inf and answered <= 2 * min(near.values()) + 0.01:
         return
     size = np.ptp(vertices, axis=0)
-    shown = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {answers.units}, {answers.up.upper()} up"
+    size_text = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {answers.units}, {answers.up.upper()} up"
     if near:
         units, up = min(near, key=near.get)
-        raise ValueError(f"{shown}: that is not around the body. Is it meant to be --units {units} --up {up}?")
+        raise ValueError(f"{size_text}: that is not around the body. Is it meant to be --units {units} --up {up}?")
     raise ValueError(
-        f"{shown}: in no unit around the body, which is {np.ptp(surface[0][:, 1]):.2f} m high with its middle at "
+        f"{size_text}: not around the body in any unit. The body is {height:.2f} m high with its middle at "
         f"{np.round(0.5 * (surface[0].min(axis=0) + surface[0].max(axis=0)), 2)}: move the mesh onto the body in its "
         "canonical pose"
     )
 
 
-def _clean(path, points: np.ndarray, faces: np.ndarray, said: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mesh without double vertices and faces without area, and for each vertex of the file which one it is now, -1
-    for none."""
-    near = cKDTree(points).query_pairs(WELD, output_type="ndarray")
-    _, first, index = np.unique(components(near, len(points)), return_index=True, return_inverse=True)
+def _clean(path: str | Path, points: np.ndarray, faces: np.ndarray) -> tuple[Working, np.ndarray]:
+    """Weld vertices at one place, and remove faces without area and vertices without a face.
+
+    Args:
+        path: of the file, for messages.
+        points: [V, 3] m, the file's vertices.
+        faces: [F, 3].
+
+    Returns:
+        The garment, nothing pinned, and for each of the file's vertices [V] its index in it, -1 for none.
+    """
+    near = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
+    _, first, welded = np.unique(components(len(points), near), return_index=True, return_inverse=True)
+    log = []
     if len(first) < len(points):
-        said.append(f"welded: {len(points) - len(first)} vertices lay on others")
-    points, faces = points[first], index[faces]
-    corners = points[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    _, unlike = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    kept = (area > 1e-10) & np.isin(np.arange(len(faces)), unlike)
-    if not kept.all():
-        said.append(f"left out: {int((~kept).sum())} faces without area, or twice there")
-    if not kept.any():
+        log.append(f"welded: {len(points) - len(first)} vertices lay on others")
+    points, faces = points[first], welded[faces]
+    area = igl.doublearea(points, faces) / 2
+    _, distinct = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    valid = (area > 1e-10) & np.isin(np.arange(len(faces)), distinct)
+    if not valid.all():
+        log.append(f"left out: {int((~valid).sum())} faces without area, or twice there")
+    if not valid.any():
         raise ValueError(f"{path}: no face has any area")
-    used = np.unique(faces[kept])
+    used = np.unique(faces[valid])
     if len(used) < len(points):
-        said.append(f"left out: {len(points) - len(used)} vertices without a face")
-    points, faces = compact(points, faces[kept])
-    now = np.full(len(first), -1)
-    now[used] = np.arange(len(used))
-    edges, _, sharing = edge_table(faces)
-    crowded = np.flatnonzero(sharing > 2)
+        log.append(f"left out: {len(points) - len(used)} vertices without a face")
+    points, faces = compact(points, faces[valid])
+    index = np.full(len(first), -1)
+    index[used] = np.arange(len(used))
+    edges, _, face_count = edge_table(faces)
+    crowded = np.flatnonzero(face_count > 2)
     if len(crowded):
         middle = np.round(points[edges[crowded[0]]].mean(axis=0), 3)
         raise ValueError(
             f"{path}: {len(crowded)} edges have more than two faces, the first at {middle} m: a cloth has two sides; "
             "separate the layers there, or delete the inner faces"
         )
-    return points, faces, now[index]
+    return Working(points, faces, np.zeros(len(points), bool), log=tuple(log)), index[welded]
 
 
-def _marked(path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
-    """Vertices [V] that the file itself marks: by a colour, or as an object."""
-    if what in ("none", "highest") and flag == "--pin":
-        return np.zeros(len(mesh.vertices), bool)
+def _marked(path: str | Path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
+    """Return which of the file's vertices [V] bool are marked there, by a colour or as an object."""
     if what == "red":
         if not mesh.red.any():
             raise ValueError(
@@ -228,90 +257,109 @@ def _marked(path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
     raise ValueError(f"{flag} {what}: choose {known}")
 
 
-def _cloth(path, mesh: Mesh, regions: tuple[str, ...], now: np.ndarray, count: int, said: list[str]):
-    """Factors [V, 3] of the cloth of each vertex; None where all is the same. A later region covers an earlier one.
+def _pin_marked(path: str | Path, working: Working, mesh: Mesh, index: np.ndarray, pin: str) -> Working:
+    """Pin the vertices that the file marks; none for `none` and `highest`.
 
     Args:
-        now: which of the `count` vertices each of the file's is, -1 for none.
+        path: of the file, for messages.
+        working: garment.
+        mesh: of the file.
+        index: for each of the file's vertices its index in the garment, -1 for none.
+        pin: the user's answer.
+    """
+    if pin in ("none", "highest"):
+        return working
+    marked = index[_marked(path, mesh, pin, "--pin")]
+    return working._replace(pinned=np.isin(np.arange(len(working.vertices)), marked))
+
+
+def _assign_cloth(
+    path: str | Path, working: Working, mesh: Mesh, index: np.ndarray, regions: tuple[str, ...]
+) -> Working:
+    """Set the cloth's factors in the regions that the user names; a later region covers an earlier one.
+
+    Args:
+        path: of the file, for messages.
+        working: garment.
+        mesh: of the file.
+        index: for each of the file's vertices its index in the garment, -1 for none.
+        regions: each WHAT=DENSITY,STRETCHING,BENDING.
     """
     if not regions:
-        return None
-    factors, (low, high) = np.ones((count, 3)), FACTORS
+        return working
+    factors, (low, high) = np.ones((len(working.vertices), 3)), FACTORS
     for region in regions:
-        what, _, given = region.rpartition("=")
+        what, _, numbers = region.rpartition("=")
         try:
-            wanted = np.array([float(x) for x in given.split(",")])
+            values = np.array([float(x) for x in numbers.split(",")])
         except ValueError:
-            wanted = np.zeros(0)
-        if len(wanted) != 3 or not ((wanted >= low) & (wanted <= high)).all():
+            values = np.zeros(0)
+        if len(values) != 3 or not ((values >= low) & (values <= high)).all():
             raise ValueError(
                 f"--cloth {region}: give WHAT=DENSITY,STRETCHING,BENDING, each how many times as much as elsewhere, "
                 f"from {low} to {high}, as red=1,4,10"
             )
-        there = np.setdiff1d(now[_marked(path, mesh, what, "--cloth")], [-1])
-        factors[there] = wanted
-        said.append(
-            f"{what}: {len(there)} vertices with {wanted[0]:g} times the weight, {wanted[1]:g} times the stiffness, "
-            f"{wanted[2]:g} times that of bending"
+        members = np.setdiff1d(index[_marked(path, mesh, what, "--cloth")], [-1])
+        factors[members] = values
+        working = working.logged(
+            f"{what}: {len(members)} vertices with {values[0]:g} times the weight, {values[1]:g} times the stiffness, "
+            f"{values[2]:g} times that of bending"
         )
-    return factors
+    return working._replace(cloth=factors)
 
 
-def _oriented(path, points, faces, surface, flip: bool, said: list[str]) -> np.ndarray:
-    """Faces of each part turned one way, with the outside away from the body."""
+def _orient(path: str | Path, working: Working, surface: Surface, flip: bool) -> Working:
+    """Turn the faces of each part one way, with the outside away from the body, or towards it for `flip`."""
+    points, faces = working.vertices, working.faces
     turned, part = igl.bfs_orient(faces)
-    halves, times = np.unique(turned[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=0, return_counts=True)
+    half_edges, times = np.unique(turned[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=0, return_counts=True)
     if times.max() > 1:
-        middle = np.round(points[halves[times.argmax()]].mean(axis=0), 3)
+        middle = np.round(points[half_edges[times.argmax()]].mean(axis=0), 3)
         raise ValueError(f"{path}: has only one side (a Moebius strip): cut it open, as along the edge at {middle} m")
-    foot = igl.signed_distance(points, *surface, sign_type=WINDING)[2]
+    nearest = igl.signed_distance(points, *surface, sign_type=WINDING)[2]
     corners = points[turned]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outward = np.bincount(part, ((points - foot)[turned].mean(axis=1) * normal).sum(axis=1))
+    outward = np.bincount(part, ((points - nearest)[turned].mean(axis=1) * normal).sum(axis=1))
     wrong = (outward < 0) != flip
     turned = np.where(wrong[part][:, None], turned[:, ::-1], turned)
     changed = int((_winding(turned) != _winding(faces)).sum())
-    if changed:
-        said.append(f"turned: {changed} of {len(faces)} faces, so that all look away from the body")
-    return turned
+    working = working._replace(faces=turned)
+    if not changed:
+        return working
+    return working.logged(f"turned: {changed} of {len(faces)} faces, so that all look away from the body")
 
 
 def _winding(faces: np.ndarray) -> np.ndarray:
-    """Whether each face [F, 3] goes through its vertices in ascending order, but for where it starts."""
+    """Return for each face [F, 3] whether the vertex after its lowest is the lower of the other two."""
     start = faces.argmin(axis=1)
     rows = np.arange(len(faces))
     return faces[rows, (start + 1) % 3] < faces[rows, (start + 2) % 3]
 
 
-def _resampled(points, faces, marked, wanted: int, said: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surface with about so many vertices, each of them pinned if the nearest before was."""
-    shape, triangles, length = resample(points, faces, wanted)
-    said.append(f"remeshed: {len(points)} vertices to {len(shape)}, edges of {1e3 * length:.0f} mm")
-    if not marked.any():
-        return shape, triangles, np.zeros(len(shape), bool)
-    return shape, triangles, cKDTree(points[marked]).query(shape)[0] < 0.5 * length
+def _resample(working: Working, count: int) -> Working:
+    """Remesh to about `count` vertices; pins and cloth are those of the nearest vertices before."""
+    vertices, faces, length = resample(working.vertices, working.faces, count)
+    pinned, cloth = np.zeros(len(vertices), bool), working.cloth
+    if working.pinned.any():
+        pinned = cKDTree(working.vertices[working.pinned]).query(vertices)[0] < 0.5 * length
+    if cloth is not None:
+        cloth = cloth[cKDTree(working.vertices).query(vertices)[1]]
+    line = f"remeshed: {len(working.vertices)} vertices to {len(vertices)}, edges of {1e3 * length:.0f} mm"
+    return Working(vertices, faces, pinned, cloth, working.log).logged(line)
 
 
-def _bare(points: np.ndarray, body: Body, names: tuple[str, ...]) -> np.ndarray:
-    """Whether each vertex of the body [B] is of a forearm or a hand that the garment does not cover: a skirt must not
-    follow the hands beside it."""
-    hidden = limbs(body, names, FOREARM)
-    distance, nearest = cKDTree(body.vertices).query(points)
-    covered = (hidden[nearest] & (distance < LOOSE)).mean() > 0.01
-    return hidden & ~covered
-
-
-def _pushed_out(path, points: np.ndarray, faces: np.ndarray, surface, said: list[str]) -> np.ndarray:
-    """The mesh out of the body."""
+def _push_out(path: str | Path, working: Working, surface: Surface) -> Working:
+    """Push the garment out of the body; refuse one that is deep inside it or cannot be pushed out."""
+    points = working.vertices
     signed = igl.signed_distance(points, *surface, sign_type=WINDING)[0]
-    deep, deepest = float((signed < -DEEP).mean()), np.round(points[signed.argmin()], 2)
-    if deep > MANY:
+    deep_share, deepest = float((signed < -DEEP).mean()), np.round(points[signed.argmin()], 2)
+    if deep_share > MAX_DEEP_SHARE:
         raise ValueError(
-            f"{path}: {100 * deep:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, at most "
-            f"{-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose; --body names "
-            "the body"
+            f"{path}: {100 * deep_share:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, "
+            f"at most {-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose; --body "
+            "names the body"
         )
-    cleared = push_out(points, faces, *surface)
+    cleared = push_out(points, working.faces, *surface)
     signed = igl.signed_distance(cleared, *surface, sign_type=WINDING)[0]
     if signed.min() < 0:
         place = np.round(points[signed.argmin()], 2)
@@ -320,16 +368,44 @@ def _pushed_out(path, points: np.ndarray, faces: np.ndarray, surface, said: list
             "move them out of it"
         )
     moved = np.linalg.norm(cleared - points, axis=1)
-    if moved.any():
-        said.append(
-            f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most"
-        )
-    return cleared
+    working = working._replace(vertices=cleared)
+    if not moved.any():
+        return working
+    return working.logged(
+        f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most"
+    )
+
+
+def _pin_highest_opening(path: str | Path, working: Working) -> Working:
+    """Pin the highest boundary loop."""
+    if not boundary_loops(working.faces):
+        raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
+    return working._replace(pinned=highest_opening(working.vertices, working.faces))
+
+
+def _log_counts(working: Working) -> Working:
+    """Log the number of vertices, faces, parts, openings and pins."""
+    vertices, faces, pinned = working.vertices, working.faces, working.pinned
+    parts = 1 + int(components(len(vertices), faces).max())
+    return working.logged(
+        f"{len(vertices)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, "
+        f"{len(boundary_loops(faces))} openings, {int(pinned.sum())} vertices pinned"
+    )
+
+
+def _uncovered_arms(points: np.ndarray, body: Body, names: tuple[str, ...]) -> np.ndarray:
+    """Return the body's vertices [B] bool of forearms and hands, none if the garment covers those.
+
+    A skirt must not follow the hands beside it.
+    """
+    arms = limbs(body, names, FOREARM)
+    distance, nearest = cKDTree(body.vertices).query(points)
+    covered = (arms[nearest] & (distance < LOOSE_DISTANCE)).mean() > 0.01
+    return arms & ~covered
 
 
 def draw(path: str | Path, garment: Garment, body: Body) -> None:
-    """A picture of the garment on the body from four sides, with pinned vertices as red dots; without the extra
-    `render`, none."""
+    """Draw the garment on the body from four sides, pinned vertices as red dots; needs the extra `render`."""
     surfaces = [
         ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN),
         ray_cast.Surface(garment.vertices, garment.faces),
@@ -339,7 +415,7 @@ def draw(path: str | Path, garment: Garment, body: Body) -> None:
     if len(places):
         dots = (places[:, None] + np.asarray(dot.vertices)[None]).reshape(-1, 3)
         faces = (len(dot.vertices) * np.arange(len(places))[:, None, None] + np.asarray(dot.faces)[None]).reshape(-1, 3)
-        surfaces.append(ray_cast.Surface(dots, faces, PINNED))
+        surfaces.append(ray_cast.Surface(dots, faces, PIN_COLOUR))
     views = ("front", "three-quarter", "side", "back")
     try:
         size = np.ptp(garment.vertices, axis=0)

@@ -29,6 +29,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -45,6 +46,13 @@ UNREADABLE = (
 )  # fmt: skip
 ASSETS = Path(__file__).parents[1] / "assets"
 FACTORS = (0.01, 100.0)  # of a region's cloth over the garment's
+
+
+class Rig(NamedTuple):
+    """A body and the names of its joints, read from one file."""
+
+    body: Body
+    names: tuple[str, ...]  # [J]
 
 
 class NewerFormat(ValueError):
@@ -92,6 +100,15 @@ def load_body(path: str | Path) -> Body:
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
     """
+    return load_rig(path).body
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read the body in a file (or embedded) as `load_body` does, and the names of its joints.
+
+    Raises:
+        ValueError: naming the file, the dataset and the first wrong entry.
+    """
     with _open(path, "body") as file:
         sizes: dict[str, int] = {}
         vertices = _floats(file, "vertices", ("B", 3), sizes)
@@ -111,8 +128,7 @@ def load_body(path: str | Path) -> Body:
         if "posedirs" in file:
             shape = ("B", 3, 9 * (sizes["J"] - 1))
             body = body._replace(posedirs=_floats(file, "posedirs", shape, sizes))
-        _names(file, sizes)
-        return body
+        return Rig(body, _names(file, sizes))
 
 
 def load_garment(path: str | Path, body: Body) -> Garment:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search
@@ -39,12 +40,14 @@ class Laws(NamedTuple):
 LAWS = Laws()
 
 
-def touching(position: Array, contact: Contact) -> Array:
+def touching(position: Float[Array, "V 3"], contact: Contact) -> Bool[Array, " V"]:
     """Return bool [V]: which vertices [V, 3] m are within `FRICTION_RADIUS` of their contact planes."""
     return contact_search.distance(position, contact.point, contact.normal) < FRICTION_RADIUS
 
 
-def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS) -> dict[str, Array]:
+def elements(
+    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
+) -> dict[str, Array]:
     """Every term of the incremental potential at new positions [V, 3] m, element by element, in J.
 
     The sums of these are what training minimises and what the reference solver minimises: there is no other energy.
@@ -82,7 +85,9 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws
     return {name: values for name, values in terms.items() if name not in config.without}
 
 
-def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig, laws: Laws = LAWS) -> Array:
+def edge_collision(
+    ends: Float[Array, "*n 2 3"], contact: EdgeContact, config: PhysicsConfig, laws: Laws = LAWS
+) -> Float[Array, "*n"]:
     """Collision energy [...] J of edges [..., 2, 3] m at the places that touch."""
     start, end = ends[..., 0, :], ends[..., 1, :]
     # differences first: far from the origin the place itself is coarse
@@ -91,18 +96,22 @@ def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig, law
     return config.collision_stiffness * laws.collision(distance, config.collision_offset)
 
 
-def self_collision(points: Array, contact: SelfContact, config: PhysicsConfig, laws: Laws = LAWS) -> Array:
+def self_collision(
+    points: Float[Array, "*n 4 3"], contact: SelfContact, config: PhysicsConfig, laws: Laws = LAWS
+) -> Float[Array, "*n"]:
     """Collision energy [...] J of vertices and the corners of the triangles they may touch [..., 4, 3] m."""
     offset = jnp.sum(contact.weights[..., :, None] * (points[..., :1, :] - points[..., 1:, :]), axis=-2)
     distance = jnp.sum(offset * contact.normal, axis=-1)
     return config.collision_stiffness * laws.collision(distance, config.self_offset)
 
 
-def energies(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS) -> dict[str, Array]:
+def energies(
+    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
+) -> dict[str, Array]:
     """The terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
     return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws).items()}
 
 
-def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
+def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Float[Array, ""]:
     """The incremental potential in J at unit physical weights: what a time step of the cloth minimises."""
     return sum(energies(new, step, mesh, config).values())

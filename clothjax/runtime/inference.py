@@ -200,7 +200,7 @@ def crowd(models: Sequence[Model]) -> Model:
     """
     if not models:
         raise ValueError("a crowd needs at least one model")
-    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=None)) for model in models)
+    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=models[0].wearer)) for model in models)
     for number, (leaves, structure) in enumerate(others, 1):
         same = structure == first[1] and all(a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0]))
         if not same:

@@ -9,13 +9,15 @@ import igl
 import numpy as np
 import pytest
 import trimesh
+import tyro
 from samples import AMC, ASF, BVH
 from scipy.spatial.transform import Rotation
 
 from clothjax.body import plausibility, skinning
 from clothjax.files import storage
+from clothjax.geometry import topology
 from clothjax.types import Body
-from data_prep import anny, asf_amc, bvh, garment, mesh, procedural, retarget
+from data_prep import amass, anny, asf_amc, bvh, garment, mesh, procedural, program, retarget, smpl
 from data_prep.diffusion import diffuse
 from data_prep.dressing import WINDING
 from data_prep.remesh import remesh
@@ -32,6 +34,29 @@ def body():
 @pytest.fixture(scope="module")
 def names():
     return storage.joint_names("body")
+
+
+# Command lines
+
+
+@pytest.mark.parametrize("module", [amass, anny, asf_amc, bvh, garment, procedural, smpl])
+def test_help_shows_an_example_that_can_be_parsed(module, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [module.__file__, "--help"])
+    with pytest.raises(SystemExit) as end:
+        program.run(module.main, module.Arguments, module.__doc__)
+    shown = capsys.readouterr().out
+    examples = [line.split() for line in shown.splitlines() if line.startswith(f"    python -m {module.__name__} ")]
+    assert end.value.code == 0 and examples and f"usage: python -m {module.__name__}" in shown
+    for example in examples:
+        assert isinstance(tyro.cli(module.Arguments, args=example[3:]), module.Arguments)
+
+
+def test_underscores_in_an_option_get_its_new_name(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["bvh.py", "a.bvh", "a_b.h5", "--drop_clavicles=3"])
+    with pytest.raises(SystemExit) as end:
+        program.run(bvh.main, bvh.Arguments, bvh.__doc__)
+    assert end.value.code == 1
+    assert capsys.readouterr().err.startswith("error: --drop_clavicles: write --drop-clavicles;")
 
 
 # Generated motions
@@ -275,7 +300,7 @@ def test_clip_leaves_half_a_ball_with_its_rim_on_the_plane():
     normal = np.array([0.3, 0.9, 0.1])
     cut, triangles = mesh.clip(vertices, faces, vertices @ normal - 0.05)
     assert (cut @ normal).max() < 0.05 + 1e-3
-    (rim,) = mesh.boundary_loops(triangles)
+    (rim,) = topology.boundary_loops(triangles)
     np.testing.assert_allclose(cut[rim] @ normal, 0.05, atol=1e-3)
     assert _euler(cut, triangles) == 1
     below = 0.05 / np.linalg.norm(normal)
@@ -299,7 +324,7 @@ def test_remesh_keeps_surface_and_rim_and_evens_the_edges(length):
     lengths = np.linalg.norm(found[edges[:, 0]] - found[edges[:, 1]], axis=1)
     assert lengths.mean() == pytest.approx(length, rel=0.1) and lengths.std() < 0.15 * lengths.mean()
     assert count.max() == 2 and _euler(found, triangles) == 1
-    (rim,) = mesh.boundary_loops(triangles)
+    (rim,) = topology.boundary_loops(triangles)
     np.testing.assert_allclose(found[rim, 1], 0, atol=2e-3)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=0.005)
     normals = igl.per_face_normals(found, triangles, np.zeros(3))
@@ -342,7 +367,7 @@ def test_tight_diffusion_reproduces_linear_data(spread):
     body = _sphere_body()
     vertices, faces = mesh.clip(1.02 * np.asarray(body.vertices), body.faces, body.vertices[:, 1] - 0.3)
     weights, shapedirs = diffuse(vertices, faces, body, spread=spread)
-    inner = ~mesh.boundary_mask(faces, len(vertices)) if spread else np.ones(len(vertices), bool)
+    inner = ~topology.boundary_mask(faces, len(vertices)) if spread else np.ones(len(vertices), bool)
     np.testing.assert_allclose(weights[inner, 0], (1 + vertices[inner, 0] / 1.02) / 2, atol=0.01 + spread / 4)
     np.testing.assert_allclose(shapedirs[inner, :, 1], 2 * vertices[inner] / 1.02, atol=0.01 + spread)
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
@@ -383,7 +408,7 @@ def test_hidden_body_gives_no_data():
 def test_pinned_vertices_have_the_data_of_the_surface(samples):
     body = _sphere_body()
     vertices, faces = mesh.clip(1.02 * np.asarray(body.vertices), body.faces, body.vertices[:, 1] - 0.3)
-    pinned = mesh.boundary_mask(faces, len(vertices))
+    pinned = topology.boundary_mask(faces, len(vertices))
     weights, shapedirs = diffuse(vertices, faces, body, samples=samples, pinned=pinned)
     np.testing.assert_allclose(weights[pinned, 0], (1 + vertices[pinned, 0] / 1.02) / 2, atol=2e-3)
     np.testing.assert_allclose(shapedirs[pinned, :, 1], 2 * vertices[pinned] / 1.02, atol=5e-3)
@@ -395,7 +420,7 @@ def test_what_is_not_pinned_is_blurred_as_ever(samples):
     right = (np.asarray(body.vertices)[:, :1] > 0).astype(float)
     body = body._replace(weights=np.concatenate([right, 1 - right], axis=1))
     vertices, faces = mesh.clip(1.02 * np.asarray(body.vertices), body.faces, body.vertices[:, 1] - 0.3)
-    pinned = mesh.boundary_mask(faces, len(vertices))
+    pinned = topology.boundary_mask(faces, len(vertices))
     weights, _ = diffuse(vertices, faces, body, samples=samples, pinned=pinned)
     blurred, _ = diffuse(vertices, faces, body, samples=samples)
     away = vertices[:, 1] < vertices[pinned, 1].min() - 0.5
@@ -429,7 +454,7 @@ def test_skirt_template(tmp_path, body, names):
     skirt = storage.load_garment(path, body)
     faces = skirt.faces.astype(np.int64)
     assert len(skirt.vertices) == pytest.approx(300, rel=0.05)
-    top, hem = sorted(mesh.boundary_loops(faces), key=lambda loop: -skirt.vertices[loop, 1].mean())
+    top, hem = sorted(topology.boundary_loops(faces), key=lambda loop: -skirt.vertices[loop, 1].mean())
     np.testing.assert_array_equal(np.flatnonzero(skirt.pinned), np.sort(top))
     assert np.ptp(skirt.vertices[hem, 1]) < 0.01
     points = np.concatenate([skirt.vertices, skirt.vertices[faces].mean(axis=1)]).astype(np.float64)

@@ -183,8 +183,7 @@ def test_a_recording_moves_an_smpl_body_as_it_is(model, tmp_path):
 
 def test_a_recording_moves_the_embedded_body_possibly(tmp_path):
     np.savez(tmp_path / "clip.npz", **recording())
-    motion, names = amass.carry(amass.read_amass(tmp_path / "clip.npz"), "body")
-    body = storage.load_body("body")
+    motion, (body, names) = amass.retarget_amass(amass.read_amass(tmp_path / "clip.npz"), "body")
     assert names == storage.joint_names("body")
     assert plausibility.bad_frames(motion, body).size == 0
     places = plausibility.joint_positions(motion, body)

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from clothjax.files import storage
+from clothjax.geometry.topology import boundary_mask
 from data_prep import dressing, garment, user_mesh
-from data_prep.mesh import boundary_mask
 from data_prep.user_mesh import Answers, bring
 
 
@@ -62,7 +62,7 @@ def test_a_mesh_that_fits_is_left_as_it_is(skirt, body, names, save):
 @pytest.mark.parametrize("units, up", [("cm", "y"), ("mm", "z"), ("m", "z"), ("in", "y")])
 def test_units_and_axes_are_asked_for(skirt, body, names, save, units, up):
     vertices, faces = skirt
-    path = save(vertices @ user_mesh.TURNS[up] / user_mesh.UNITS[units], faces)
+    path = save(vertices @ user_mesh.TO_Y_UP[up] / user_mesh.UNITS[units], faces)
     with pytest.raises(ValueError, match=rf"skirt\.obj.*--units {units} --up {up}\?"):
         bring(path, body, names, Answers())
     made, _ = bring(path, body, names, Answers(units, up))

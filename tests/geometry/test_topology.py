@@ -58,7 +58,7 @@ def test_an_edge_of_three_faces_makes_one_hinge_of_the_first_two():
 
 def test_every_edge_of_a_closed_mesh_has_a_hinge():
     assert len(topology.mesh(TETRAHEDRON).hinges) == len(topology.edges(TETRAHEDRON)) == 6
-    assert len(topology.boundary_vertices(TETRAHEDRON)) == len(topology.boundary_loops(TETRAHEDRON)) == 0
+    assert not topology.boundary_mask(TETRAHEDRON, 4).any() and topology.boundary_loops(TETRAHEDRON) == []
 
 
 def test_edges_are_sorted_unique_and_those_of_the_faces():
@@ -82,22 +82,24 @@ def test_components_are_numbered_by_their_lowest_vertices():
     assert topology.components(3, np.zeros((0, 2), int)).tolist() == [0, 1, 2]
 
 
-def test_loops_of_a_tube_are_its_rims_in_face_direction():
-    faces = tube(4, 6)
+def test_components_from_faces_are_those_from_edges():
+    faces = np.concatenate([sheet(3, 3), sheet(2, 4) + 12])
+    from_faces = topology.components(21, faces)
+    np.testing.assert_array_equal(from_faces, topology.components(21, topology.edges(faces)))
+    assert from_faces.tolist() == [0] * 9 + [1, 2, 3] + [4] * 8 + [5]
+
+
+def test_boundaries_of_a_tube_are_its_rims():
+    faces = np.random.default_rng(3).permutation(tube(4, 6))
+    faces[1] = faces[1, ::-1]  # the direction of a face does not matter
     loops = topology.boundary_loops(faces)
-    assert [sorted(loop.tolist()) for loop in loops] == [list(range(6)), list(range(18, 24))]
-    half_edges = {(face[i], face[(i + 1) % 3]) for face in faces.tolist() for i in range(3)}
-    for loop in loops:
-        assert loop[0] == loop.min()
-        assert all((a, b) in half_edges for a, b in zip(loop.tolist(), np.roll(loop, -1).tolist()))
-    assert topology.boundary_vertices(faces).tolist() == [*range(6), *range(18, 24)]
+    assert [loop.tolist() for loop in loops] == [list(range(6)), list(range(18, 24))]
+    assert np.flatnonzero(topology.boundary_mask(faces, 25)).tolist() == [*range(6), *range(18, 24)]
 
 
-def test_a_loop_is_whole_where_faces_disagree_in_direction():
-    faces = sheet(3, 3)
-    faces[1] = faces[1, ::-1]
-    (loop,) = topology.boundary_loops(faces)
-    assert sorted(loop.tolist()) == [0, 1, 2, 3, 5, 6, 7, 8]
+def test_boundaries_that_share_a_vertex_are_one():
+    faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]])
+    assert [loop.tolist() for loop in topology.boundary_loops(faces)] == [[0, 1, 2, 3, 4], [5, 6, 7]]
 
 
 @pytest.mark.parametrize(
