@@ -123,7 +123,7 @@ def test_facing_and_place_are_not_seen(built):
     config = whole.config
     betas = jnp.linspace(-1, 1, 10)
     constants = psi.constant_inputs(betas, material.configured_material(config), config.material)
-    poses = motion_clips.poses(reel, 7)
+    poses = motion_clips.poses(reel, jnp.int32(7))
     memory = 0.1 * jnp.ones(animators.memory_size(whole.scene, config))
 
     @jax.jit
