@@ -30,6 +30,24 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in MODELS.glob(f"*/{WEIGHTS}")))
 
 
+def find(model: str | Path) -> Path:
+    """The folder of a model: of a run, of a packed model, or of a garment that comes with the library, by its name.
+
+    A garment of the library comes before a folder that is called the same, which is found as `./skirt`.
+
+    Raises:
+        ValueError: if there is no such folder and no such garment.
+    """
+    if str(model) in shipped():
+        return MODELS / str(model)
+    if Path(model).is_dir():
+        return Path(model)
+    raise ValueError(
+        f"{model}: no such folder, and no garment called so comes with clothjax; give a run's folder, a packed folder "
+        f"or a name: {', '.join(shipped()) or 'none comes with this clothjax'}"
+    )
+
+
 def folder(name: str) -> Path:
     """Where a garment that comes with the library is.
 

@@ -98,10 +98,10 @@ def wins(points: list[dict]) -> dict:
         if not (ours and theirs):
             continue
         won["compared"].append(garment)
-        whole = theirs["ncs"]
-        if not all(np.isfinite(whole[error]) for error in ERRORS):
+        published = theirs["ncs"]
+        if not all(np.isfinite(published[error]) for error in ERRORS):
             raise ValueError(f"the errors of NCS on {garment} are not finite: its training diverged; train it again")
-        usable = [p for p in theirs.values() if all(p[error] <= USABLE * whole[error] for error in ERRORS)]
+        usable = [p for p in theirs.values() if all(p[error] <= USABLE * published[error] for error in ERRORS)]
         fastest = min(usable, key=lambda p: p["us"])
         in_time = [p for p in ours.values() if p["us"] <= fastest["us"]]
         if any(all(p[error] < fastest[error] for error in ERRORS) for p in in_time):
@@ -139,13 +139,15 @@ def _better(one: dict, other: dict, error: str) -> bool:
 
 
 def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps: int) -> dict[str, float]:
-    whole, measures, swings = case.whole, [], []
+    experiment, measures, swings = case.experiment, [], []
     for clip, track, reference in zip(case.clips, tracks, solved, strict=True):
         poses = windows(clip)
         frames = np.unique(np.linspace(SETTLING_FRAMES, len(track) - 2, gaps).astype(int))
-        measures += metrics.step_measures(whole.scene, case.character, jnp.asarray(track), poses, frames, whole.config)
-        skinned = skinned_trajectory(whole, case.character, poses)
-        beside = metrics.beside_solver(whole.scene, *(x[SETTLING_FRAMES:] for x in (track, reference, skinned)))
+        measures += metrics.step_measures(
+            experiment.scene, case.character, jnp.asarray(track), poses, frames, experiment.config
+        )
+        skinned = skinned_trajectory(experiment, case.character, poses)
+        beside = metrics.beside_solver(experiment.scene, *(x[SETTLING_FRAMES:] for x in (track, reference, skinned)))
         ratio, correlation = beside["swing_ratio"], beside["swing_correlation"]
         swings.append(ratio**2 + 1.0 - 2.0 * ratio * correlation)  # of |a - b|^2 / |b|^2
     found = metrics.gaps(measures)

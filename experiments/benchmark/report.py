@@ -34,7 +34,6 @@ With `--compare OLD.json` the times of both reports are set beside each other, a
 the noise of both; of `pareto`, also whether both put the points in the same order (Kendall's tau).
 """
 
-import argparse
 import json
 import os
 import platform
@@ -45,6 +44,7 @@ from pathlib import Path
 
 import jax
 
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.files import configuration
 from clothjax.runtime import trained
@@ -69,22 +69,22 @@ QUICK = [  # what compiles soonest
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("runs", nargs="*", help="of the part pareto: folders of runs, names of shipped garments")
+    parser = cli.Parser("experiments.benchmark", __doc__)
+    cli.model_argument(parser, nargs="*", about="; for the part pareto, several")
     parser.add_argument("--part", choices=PARTS, default=None, help="default: all")
     parser.add_argument("--json", type=Path, default=Path("benchmark.json"))
     parser.add_argument("--plot", type=Path, default=None, help="default: beside the JSON")
     parser.add_argument("--quick", action="store_true", help="a small network, few rounds, little compilation")
     parser.add_argument("--compare", type=Path, default=None, help="the JSON of an earlier run")
     arguments = parser.parse_args(argv)
-    if arguments.part not in (None, "pareto") and arguments.runs:
+    if arguments.part not in (None, "pareto") and arguments.model:
         raise ValueError("runs are for the part pareto")
     before = earlier(arguments.compare) if arguments.compare else None
     path, plot = arguments.json, arguments.plot or arguments.json.with_suffix(".png")
     if arguments.part is None:
-        report = each_part(arguments.runs, arguments.quick, path, plot)
+        report = each_part(arguments.model, arguments.quick, path, plot)
     else:
-        report = measure(arguments.part, arguments.runs, arguments.quick)
+        report = measure(arguments.part, arguments.model, arguments.quick)
         draw(report, arguments.part, plot.with_suffix(f".{arguments.part}{plot.suffix}"))
     if before:
         report["compare"] = comparison.compare(report, before)
@@ -139,8 +139,7 @@ def measure(part: str, names: list[str], quick: bool) -> dict:
             measured = inference.measure(**(QUICK_INFERENCE if quick else INFERENCE))
         else:
             names = names or (QUICK_GARMENTS if quick else trained.shipped())
-            runs = [trained.folder(name) if name in trained.shipped() else Path(name) for name in names]
-            measured = pareto.measure(runs, **(QUICK_PARETO if quick else PARETO))
+            measured = pareto.measure([cli.model_folder(name) for name in names], **(QUICK_PARETO if quick else PARETO))
     return {"machine": machine(), part: measured | {"peaks": timing.peaks(3), "noise": timing.noise()}}
 
 

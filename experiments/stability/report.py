@@ -17,7 +17,6 @@
 What brings a state back is described in `clothjax/runtime/inference.py`.
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -25,6 +24,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.progress import progress_bar
 from experiments.stability import closed_loop, physics, solver
@@ -35,12 +35,12 @@ ORIGINS = (0.0, 100.0)  # m
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, nargs="?", default=None, help="folder of a finished run")
+    parser = cli.Parser("experiments.stability", __doc__)
+    cli.model_argument(parser, nargs="?", about="; default: only the energies and the solver")
     parser.add_argument("--json", type=Path, default=Path("stability.json"))
     parser.add_argument("--quick", action="store_true", help="a tenth of it")
     arguments = parser.parse_args(argv)
-    report, curves = stress(arguments.run, arguments.quick)
+    report, curves = stress(arguments.model and cli.model_folder(arguments.model), arguments.quick)
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
     arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     picture = arguments.json.with_suffix(".png")
