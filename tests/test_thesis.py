@@ -60,7 +60,7 @@ def test_a_template_takes_the_place_of_a_garment_that_is_not_embedded(tmp_path, 
     path = thesis.cloth("tank", tmp_path)
     assert path == str(tmp_path / "garments" / "tank.h5")
     assert 200 < len(storage.load_garment(path, storage.load_body("body")).vertices) < 400
-    monkeypatch.setattr(thesis.garments, "main", lambda _: pytest.fail("made again"))
+    monkeypatch.setattr(thesis.garment_module, "main", lambda _: pytest.fail("made again"))
     assert thesis.cloth("tank", tmp_path) == path
 
 
