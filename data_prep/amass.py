@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
+from clothjax.cli import arguments, fail_clearly
 from clothjax.files.storage import UNREADABLE, canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
 from data_prep.repair import Bad, mend
@@ -123,4 +123,4 @@ def main(args: Arguments) -> None:
 
 if __name__ == "__main__":
     with fail_clearly():
-        main(tyro.cli(Arguments))
+        main(arguments(Arguments, "data_prep.amass", __doc__))

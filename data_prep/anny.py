@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
+from clothjax.cli import arguments, fail_clearly
 from clothjax.files.storage import save_body
 from clothjax.types import Body
 from data_prep.mesh import boundary_loops
@@ -326,4 +326,4 @@ def main(args: Arguments) -> None:
 
 if __name__ == "__main__":
     with fail_clearly():
-        main(tyro.cli(Arguments))
+        main(arguments(Arguments, "data_prep.anny", __doc__))

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
+from clothjax.cli import arguments, fail_clearly
 from clothjax.files.storage import joint_names, load_body, save_motion
 from data_prep.repair import Bad, mend
 from data_prep.retarget import Capture, cmu_names, numbers, read_lines, retarget
@@ -169,4 +169,4 @@ def main(args: Arguments) -> None:
 
 if __name__ == "__main__":
     with fail_clearly():
-        main(tyro.cli(Arguments))
+        main(arguments(Arguments, "data_prep.bvh", __doc__))

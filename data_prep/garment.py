@@ -20,7 +20,7 @@ import tyro
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import ConvexHull
 
-from clothjax.cli import fail_clearly
+from clothjax.cli import arguments, fail_clearly
 from clothjax.config import HANDS
 from clothjax.files.storage import joint_names, load_body, save_garment
 from clothjax.types import Body, Garment
@@ -322,4 +322,4 @@ def main(args: Arguments) -> None:
 
 if __name__ == "__main__":
     with fail_clearly():
-        main(tyro.cli(Arguments))
+        main(arguments(Arguments, "data_prep.garment", __doc__))

@@ -16,7 +16,7 @@ import tyro
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from clothjax.cli import fail_clearly
+from clothjax.cli import arguments, fail_clearly
 from clothjax.files.storage import canonical_rotation, joint_names, load_body, save_motion
 from clothjax.types import Motion
 from data_prep.retarget import cmu_names, from_t_pose, stand
@@ -235,4 +235,4 @@ def main(args: Arguments) -> None:
 
 if __name__ == "__main__":
     with fail_clearly():
-        main(tyro.cli(Arguments))
+        main(arguments(Arguments, "data_prep.procedural", __doc__))

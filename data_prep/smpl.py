@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse
 import tyro
 
-from clothjax.cli import fail_clearly
+from clothjax.cli import arguments, fail_clearly
 from clothjax.files.storage import UNREADABLE, save_body
 from clothjax.types import Body
 
@@ -191,4 +191,4 @@ def main(args: Arguments) -> None:
 
 if __name__ == "__main__":
     with fail_clearly():
-        main(tyro.cli(Arguments))
+        main(arguments(Arguments, "data_prep.smpl", __doc__))

@@ -1,5 +1,6 @@
 """Every program's command line: `--help` with an example, one spelling, a model named in one way."""
 
+import dataclasses
 import importlib
 import os
 import re
@@ -44,6 +45,18 @@ def test_help_shows_an_example(program, capsys):
     assert re.search(rf"(?m)^    python -m {re.escape(program)}( |$)", shown), shown
     flags = set(re.findall(r"(?m)^ +(?:-\w, )?(--[\w-]+)", shown))
     assert not [flag for flag in flags if "_" in flag] and "--motion" not in flags
+
+
+@pytest.mark.parametrize("name", ["amass", "anny", "asf_amc", "bvh", "garment", "procedural", "smpl"])
+def test_help_of_the_preparation_of_data_shows_an_example(name, capsys):
+    module = importlib.import_module(f"data_prep.{name}")
+    with pytest.raises(SystemExit) as ended:
+        cli.arguments(module.Arguments, f"data_prep.{name}", module.__doc__, ["--help"])
+    assert ended.value.code == 0 and f"    python -m data_prep.{name} " in capsys.readouterr().out
+    fields = [field.name for field in dataclasses.fields(module.Arguments) if "_" in field.name]
+    for field in fields[:1]:
+        with pytest.raises(ValueError, match=f"--{field} is now written --{field.replace('_', '-')}"):
+            cli.arguments(module.Arguments, f"data_prep.{name}", module.__doc__, [f"--{field}", "1"])
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "render", "convert"])
