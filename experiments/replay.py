@@ -49,7 +49,7 @@ def main(argv: list[str]) -> None:
 
 
 def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
-    """What the first step was made of from which on more in a row than `allowed` were not finite.
+    """A description of the first step from which on more in a row than `allowed` were not finite.
 
     Raises:
         ValueError: if the stage has finished.

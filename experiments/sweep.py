@@ -87,7 +87,7 @@ def main(argv: list[str]) -> None:
 
 
 def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, dict], dict[str, str]]:
-    """What every job returned, and why the others did not."""
+    """The reports of the jobs that finished, and why the others did not."""
     finished, failed = {}, {}
     slots = queue.SimpleQueue()  # places for a job: the GPU it has there, if any
     places = [None] * len(jobs) if chosen.slurm is not None else chosen.gpus or [None] * chosen.at_once
@@ -140,7 +140,7 @@ def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
 
 
 def table(summary: dict[str, dict]) -> str:
-    """The figures of every job's Psi, or of its peer's network, as Markdown."""
+    """The figures of every job's Psi, or of its baseline, as Markdown."""
     rows = ["| | " + " | ".join(COLUMNS) + " |", "|---" * (1 + len(COLUMNS)) + "|"]
     for name, stages in summary.items():
         last = list(stages.values())[-1]

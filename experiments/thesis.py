@@ -124,7 +124,7 @@ def cloth(name: str, folder: Path) -> str:
 
 
 def finished(run: Path, config: Config | None = None) -> bool:
-    """Whether the last stage of a run is at its last step.
+    """True where the last stage of a run is at its last step.
 
     Raises:
         ValueError: if it was trained with another configuration than this.
@@ -146,7 +146,7 @@ def finished(run: Path, config: Config | None = None) -> bool:
 
 @functools.cache
 def measures(run: Path) -> dict[str, dict[str, float]]:
-    """What `experiments.evaluate` says of each stage of a run."""
+    """The measures of each stage of a run, as of `clothjax evaluate`."""
     return evaluate(run)["evaluation"]
 
 
@@ -176,7 +176,7 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
         rows, columns = pictures.at_moments(experiment, motion, tracks | {"solver": solver}, MOMENTS)
         parts.append(f"<h3>{garment}</h3>" + table(figures[garment]) + sheet(rows, columns))
     text = (
-        "<p>Every network in its own closed loop on a motion and a body that none has seen. A gap of 0 is the solver, "
+        "<p>Every network in its own rollout on a motion and a body that none has seen. A gap of 0 is the solver, "
         "1 plain skinning (energy) or cloth that keeps its shape (hold).</p>"
     )
     return figures, ("Figure 5: ours and NCS", text + "".join(parts))
@@ -295,7 +295,7 @@ def times(runs: Runs) -> tuple[dict, Section]:
     columns = {"us": "us a frame"} | {key: label.split(":")[0] for key, label in pareto.ERRORS.items()}
     won = ", ".join(f"{key}: {len(figures[key])}" for key in ("compared", "wins_at_equal_time", "wins_at_equal_error"))
     text = (
-        "<p>One character, weights in the cache; Psi and the networks of peers in ONNX Runtime on one thread, with "
+        "<p>One character, weights in the cache; Psi and the baselines in ONNX Runtime on one thread, with "
         "pose inputs and joint transforms given unless it says from the pose; C from the pose; jax on all cores. "
         f"Of the garments with both: {won}.</p>"
     )

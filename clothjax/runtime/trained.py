@@ -1,4 +1,4 @@
-"""What training left: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
+"""Trained models: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
 A packed model is a folder with `model.npz` and `config.yaml`, and `report.json` where that says how it was made. Large
 matrices are kept in eight bits with a scale for each column (`NAME` and `NAME|scale`), the blend shapes and the
@@ -63,19 +63,19 @@ def phi(run: str | Path) -> tuple[Config, dict]:
     """The configuration and the `params` and `statistics` of Phi, of a run or a packed model.
 
     Raises:
-        ValueError: if there is no readable one, as of a peer's run.
+        ValueError: if there is no readable one, as of a baseline's run.
     """
     config, model = network(run)
     if config.peer.network:
         raise ValueError(
-            f"{run}: is of a peer's network ({config.peer.network}), which has no Phi: only experiments.evaluate and "
+            f"{run}: is of a baseline ({config.peer.network}), which has no Phi: only `clothjax evaluate` and "
             "experiments.benchmark use it"
         )
     return config, model
 
 
 def network(run: str | Path) -> tuple[Config, dict]:
-    """As `phi`, or a peer's network in its place.
+    """As `phi`, or a baseline's network in its place.
 
     Raises:
         ValueError: if there is no readable one.
@@ -123,7 +123,7 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
 
 
 def packed(run: str | Path) -> bool:
-    """Whether a folder is a packed model."""
+    """True for a folder of a packed model."""
     return (Path(run) / WEIGHTS).is_file()
 
 

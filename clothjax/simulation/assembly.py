@@ -20,7 +20,7 @@ MEASURABLE = 12  # frames of a motion, at least, for all that is measured of it
 
 
 class Experiment(NamedTuple):
-    """What a configuration names, loaded."""
+    """The parts that a configuration names, loaded."""
 
     config: Config
     names: tuple[str, ...]  # of the joints

@@ -38,7 +38,7 @@ NEAR = 1.0  # mm, the error that is put up with
 
 
 def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS) -> dict:
-    """All figures: those against NCS at the paper's size, those of a garment of the library, floors and variants."""
+    """The figures: those against NCS at the paper's size, those of a garment of the library, floors and variants."""
     with tempfile.TemporaryDirectory() as folder:
         shipped = _shipped(Path(folder), rounds, frames)
         errors = {variant["name"]: variant["error_mm"] for variant in shipped["variants"]}
@@ -121,7 +121,7 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
 
 
 def _shipped(folder: Path, rounds: int, frames: int) -> dict:
-    """Variants of a garment of the library: time, bytes, and distance to jax's unspecialised model in closed loop."""
+    """Variants of a garment of the library: time, bytes, and distance to jax's unspecialised model in a rollout."""
     config = inference.load(SHIPPED).config
     betas = assembly.betas(config)
     model = inference.load(SHIPPED, betas=betas)
@@ -192,7 +192,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
 
 
 def _resting() -> dict:
-    """What is saved on a character that stops, and then is left alone once `resting` says so, and the error."""
+    """The time saved on a character that stops, and then is left alone once `resting` says so, and the error."""
     model = specialise.specialise(inference.load(SHIPPED))
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]

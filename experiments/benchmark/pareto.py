@@ -51,7 +51,7 @@ def measure(
         frames: of each motion; gaps: of them, at how many the solver is asked.
         motions: default: those on which all runs of a garment are evaluated.
         descent_steps: of Phi; iterations: of the solver, of which the last is until it has converged.
-        shapes: names of the forms of Psi and of peers with fewer blend shapes, and the part of them that they have.
+        shapes: names of the forms of Psi and of baselines with fewer blend shapes, and the part of them that they have.
 
     Raises:
         ValueError: if runs of a garment differ in body, physics, cloth or motions.
@@ -122,7 +122,7 @@ def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
 
 
 def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
-    """Of so many `points` that two reports have in common, Kendall's tau of their order by time and by each error."""
+    """The `points` that two reports share, and Kendall's tau of their order by time and by each error."""
     named = {(p["garment"], p["run"], p["name"]): p for p in others}
     pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
     found = {"points": len(pairs)}
@@ -133,7 +133,7 @@ def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
 
 
 def _better(one: dict, other: dict, error: str) -> bool:
-    """Whether a point is no worse in time and error, and better in one."""
+    """True for a point that is no worse in time and error, and better in one."""
     no_worse = one["us"] <= other["us"] and one[error] <= other[error]
     return no_worse and (one["us"], one[error]) != (other["us"], other[error])
 

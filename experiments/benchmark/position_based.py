@@ -24,7 +24,7 @@ NEAR = 0.03  # m, of the body, where contact is looked for
 
 
 class Xpbd:
-    """A garment on a wearer, moved from frame to frame.
+    """A garment on a character, moved from frame to frame.
 
     Args:
         substeps: of a frame, each with so many `iterations`.
@@ -107,7 +107,7 @@ def springs(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray, mu: floa
 def simulate(
     engine: Xpbd, experiment: Experiment, character: Character, poses: Pose, start: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """A closed loop [T, V, 3] m relative to the root at every frame, and its median microseconds a frame.
+    """An autoregressive rollout [T, V, 3] m relative to the root at every frame, and its median microseconds a frame.
 
     Args:
         poses: windows [T, 3, ...]; start: [V, 3] m, relative to the root at the first frame, where it stands still.

@@ -17,14 +17,14 @@ on the same garment. The plot is of the cost against the vertices.
 
 `inference` times one frame on one thread, with weights in the cache: the paper's Psi (random weights, 4 000 vertices),
 NCS's network at its published sizes, and a trained garment of the library in its variants (in plain C too where there
-is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over 300 frames of closed
-loop. `floor_us` is how long this machine takes to read as many bytes.
+is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over a rollout of 300
+frames. `floor_us` is how long this machine takes to read as many bytes.
 
 `pareto` gives time and error, on one thread, of every way to move a garment: skinning, Psi and Phi in their variants,
-the solver stopped early, and runs of peers (`configs/ncs.yaml`). It takes folders of runs and names of shipped
-garments, by default all of these; what is compared on a garment must be trained for the same physics, wearers and
+the solver stopped early, and runs of baselines (`configs/ncs.yaml`). It takes folders of runs and names of shipped
+garments, by default all of these; what is compared on a garment must be trained for the same physics, bodies and
 motions. Phi and the solver are loops and take no turns: their times are of whole loops, or medians of their frames.
-Errors are those of `experiments.evaluate`, in closed loop on motions held out of training; `swing_error` is the rms
+Errors are those of `clothjax evaluate`, in rollouts on motions held out of training; `swing_error` is the rms
 error of the velocity of what skinning does not do, over the solver's.
 
 `--quick` is not for its figures: a small Phi, few rounds and frames, one garment; and not what mostly compiles, the
@@ -106,7 +106,7 @@ def draw(report: dict, part: str, path: Path) -> None:
 
 
 def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
-    """All parts, each in a process of its own: they differ in how many cores jax may use.
+    """Every part, each in a process of its own: they differ in how many cores jax may use.
 
     Args:
         kept: where the report so far is written after each part, should the next one fail.
@@ -160,7 +160,7 @@ def earlier(path: Path) -> dict:
 
 
 def training_step(quick: bool) -> dict:
-    """All figures of stage 1."""
+    """The figures of stage 1."""
     config = configuration.cli(Config, QUICK if quick else PAPER)
     if quick:
         return stage1.measure(config, QUICK_ROUNDS, compiling=False)
@@ -178,7 +178,7 @@ def training_step(quick: bool) -> dict:
 
 
 def machine() -> dict:
-    """What the figures were measured on."""
+    """The machine that the figures were measured on."""
     return {
         "device": str(jax.devices()[0].device_kind),
         "devices": jax.device_count(),

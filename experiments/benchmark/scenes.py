@@ -1,4 +1,4 @@
-"""What a training step costs where the scene lacks something: what is absent is absent from the compiled program."""
+"""The cost of a training step where the scene lacks something: what is absent is not in the compiled program."""
 
 import dataclasses
 from collections.abc import Callable

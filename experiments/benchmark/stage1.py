@@ -1,4 +1,4 @@
-"""What a training step of Phi costs, part by part."""
+"""The cost of a training step of Phi, part by part."""
 
 import dataclasses
 import tempfile
@@ -38,7 +38,7 @@ class Moment(NamedTuple):
 
 
 def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
-    """All figures of a training step at a configuration whose body nodes take part in message passing.
+    """The figures of a training step at a configuration whose body nodes take part in message passing.
 
     Args:
         compiling: measures too how long compilation takes.

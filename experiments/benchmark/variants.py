@@ -1,4 +1,4 @@
-"""All that can move a garment, in closed loop: Psi and Phi in their variants, peers, the solver, XPBD, skinning."""
+"""Rollouts by each thing that moves a garment: Psi and Phi in their variants, baselines, the solver, XPBD, skinning."""
 
 import dataclasses
 import tempfile
@@ -42,14 +42,14 @@ class Variant(NamedTuple):
 
     family: str  # such as psi, ncs or solver
     runtime: str  # onnx, c, jax or warp
-    tracks: list[np.ndarray]  # closed loops [T - 2, V, 3] m over each of the clips, relative to the root
+    tracks: list[np.ndarray]  # rollouts [T - 2, V, 3] m over each of the clips, relative to the root
     call: Call | None  # one frame of it, to be timed beside the others
     us: float = 0.0  # a frame of the loop, where there is no `call`
     converged: float = 1.0  # share of a solver's frames
 
 
 class Case(NamedTuple):
-    """What the variants of a garment have in common."""
+    """The common ground of the variants of a garment."""
 
     experiment: Experiment
     character: Character
@@ -57,7 +57,7 @@ class Case(NamedTuple):
 
 
 def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
-    """What runs of a garment have in common: the wearer and the motions of the first one's evaluation."""
+    """The common ground of runs of a garment: the character and the motions of the first one's evaluation."""
     configs = [trained.network(run)[0] for run in runs]
     first = configs[0]
     wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
@@ -88,7 +88,7 @@ def every(
     iterations: tuple[int, ...],
     shapes: dict[str, float],
 ) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
-    """All variants of one garment by run and name, and the solver's own loops."""
+    """The variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
         network = trained.network(run)[0].peer.network
@@ -118,8 +118,8 @@ def _skinning(case: Case, folder: Path) -> Variant:
 def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
 
-    In ONNX Runtime it is timed as peers are, with pose inputs and skinning transforms given; and, as in C, from the
-    pose, which no peer does.
+    In ONNX Runtime it is timed as baselines are, with pose inputs and skinning transforms given; and, as in C, from the
+    pose, which no baseline does.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
     model = inference.load(run, betas=np.asarray(case.character.betas))
@@ -165,7 +165,7 @@ def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Var
 
 
 def _loop(case: Case, config: Config, model: dict) -> Variant:
-    """Phi's closed loop in jax, timed as a whole."""
+    """Phi's rollout in jax, timed as a whole."""
     experiment, tracks, us = case.experiment._replace(config=config), [], []
     run = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, experiment, c, p))
     for clip in case.clips:

@@ -87,7 +87,7 @@ def energies(scene: Scene, position: np.ndarray) -> dict[str, float]:
 
 
 def pins(scene: Scene, position: np.ndarray) -> float:
-    """What membrane and bending at [V, 3] m pull at the pins, downwards, over the weight of the free vertices."""
+    """The downward pull of membrane and bending at [V, 3] m on the pins, over the weight of the free vertices."""
     step = Reference(scene, 1.0).time_step()
 
     def elastic(x):

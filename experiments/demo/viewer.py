@@ -189,7 +189,7 @@ class Viewer:
         return name
 
     def _label(self, stage: str, body: np.ndarray) -> str:
-        """What a stage is called, over its head."""
+        """The name of a stage, over its head."""
         name, place = f"/{stage}/name", (body[:, 0].mean(), body[:, 1].max() + 0.1, body[:, 2].mean())
         if name in self.meshes:
             self.meshes[name].position = place

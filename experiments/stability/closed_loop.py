@@ -1,4 +1,4 @@
-"""A trained run in closed loop: long, beyond what it was trained on, and after shocks."""
+"""A trained run in autoregressive rollouts: long, beyond what it was trained on, and after shocks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,7 +30,7 @@ TELEPORT = 10.0  # m
 
 
 class Loop(NamedTuple):
-    """One closed loop."""
+    """One autoregressive rollout."""
 
     frames: int
     nonfinite: int  # frames
@@ -65,7 +65,7 @@ def _play(model: Model, poses: Pose):
 
 
 def measure(experiment: Experiment, character: Character, played: tuple) -> Loop:
-    """The figures of a closed loop."""
+    """The figures of a rollout."""
     vertices, latents, ok = played
     finite = np.isfinite(vertices).all(axis=(1, 2)) & np.isfinite(latents).all(axis=1)
     strain = (
@@ -78,7 +78,7 @@ def measure(experiment: Experiment, character: Character, played: tuple) -> Loop
 
 
 def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> dict:
-    """All loops of a run; `frames` for the longest. With `quick`, fewer variants."""
+    """Every rollout of a run; `frames` for the longest. With `quick`, fewer variants."""
     experiment, phi = load_run(run)
     config = experiment.config
     betas, cloth = assembly.betas(config), configured_material(config)
@@ -186,7 +186,7 @@ def energies(experiment: Experiment, character: Character, track: np.ndarray, mo
 
 
 def energies_of(experiment: Experiment, character: Character, track: np.ndarray, poses: Pose) -> np.ndarray:
-    """What is stored in the cloth and in its motion at the steps of a track [T, V, 3] m, in J: [T - 2].
+    """The energy stored in the cloth and in its motion at the steps of a track [T, V, 3] m, in J: [T - 2].
 
     All terms but gravity, whose zero is anywhere.
     """

@@ -39,7 +39,7 @@ def points(random: np.random.Generator, count: int, corners: int) -> np.ndarray:
 
 
 def terms(random: np.random.Generator, count: int) -> dict[str, tuple[Callable, np.ndarray, tuple]]:
-    """Of each term its energy of one element, `count` elements to take it at, and the rest of its arguments."""
+    """For each term its energy of one element, `count` elements to take it at, and the rest of its arguments."""
 
     def unit(vectors):
         return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
