@@ -79,15 +79,15 @@ def test_a_finished_run_is_not_trained_again(finished):
 
 @pytest.mark.slow
 def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch):
-    evaluate.main([str(finished), "--motion", "twist_3", "--json", str(finished / "twist.json")])
+    evaluate.main([str(finished), "--motions", "twist_3", "--json", str(finished / "twist.json")])
     assert "twist_3" in json.loads((finished / "twist.json").read_text())["motions"]
     assert "| hold_gap |" in capsys.readouterr().out
-    render.main([str(finished), "--motion", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
+    render.main([str(finished), "--motions", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
     assert Image.open(finished / "t.webp").n_frames == 3
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
     picture = finished / "bodies.png"
-    monkeypatch.setattr(gallery, "BODIES", ("heavy",))
+    monkeypatch.setattr(pictures, "GALLERY_BODIES", ("heavy",))
     gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(picture)])
     width, height = Image.open(picture).size
     assert width > pictures.GALLERY_SIZE[0] and height > 3 * pictures.GALLERY_SIZE[1]  # a body; three methods
@@ -111,8 +111,8 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
     clip = assembly.motion(whole, "walk_3")
     one, other = (rollouts.psi_trajectory(inference.load(which), clip)[:20] for which in (finished, "toy"))
     assert 0 < metrics.distance_mm(one, other).max() < 1.0
-    with pytest.raises(ValueError, match="no garment called 'coat' comes with clothjax; there are: toy"):
-        render.main(["--pretrained", "coat", "--out", "x.png"])
+    with pytest.raises(ValueError, match=r"coat: no such folder, and no garment called so .* or a name: toy"):
+        render.main(["coat", "--out", "x.png"])
     whole_file = (tmp_path / "toy" / "model.npz").read_bytes()
     for damaged in (whole_file[: size // 2], b"", whole_file[: size // 2] + b"?" + whole_file[size // 2 + 1 :]):
         (tmp_path / "toy" / "model.npz").write_bytes(damaged)

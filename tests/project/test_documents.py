@@ -51,7 +51,7 @@ def test_commands(workplace):
             continue
         for pattern, short in SHORT:
             command = re.sub(pattern, short, command)
-        if "experiments.train" in command or "experiments.sweep" in command:
+        if "experiments.train" in command or "clothjax train" in command or "experiments.sweep" in command:
             command += " " + SMALL
         program, *rest = shlex.split(command)
         print(command, flush=True)
