@@ -170,7 +170,7 @@ def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solver
 
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate.trained, "network", lambda _: (Config(), {}))
+    monkeypatch.setattr(trained, "network", lambda _: (Config(), {}))
     figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
 
     def measured(folder, motions):
