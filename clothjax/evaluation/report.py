@@ -35,9 +35,9 @@ CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, 
 
 
 def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
-    """The report of each garment under its name, and under `mean` the means of its stages over garments."""
+    """The report of each garment under its name, and under `mean` the means of the stages that all have."""
     if not folders:
-        raise ValueError("no garments come with this clothjax; pack some with experiments.ship")
+        raise ValueError("no garments come with this clothjax; train one with `python -m clothjax train`")
     reports = {}
     for name, folder in folders.items():
         there = motions
@@ -46,7 +46,8 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) 
             there = [motion for motion in wanted if storage.asset(motion).is_file()]
             print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
         reports[name] = evaluate(folder, there)
-    stages = next(iter(reports.values()))["evaluation"]
+    first, *others = (report["evaluation"] for report in reports.values())
+    stages = [stage for stage in first if all(stage in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
     return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in stages}} | flat
 

@@ -155,7 +155,7 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     assert (other[3].pose.low < one[3].pose.low).any() and (other[3].pose.high > one[3].pose.high).any()
     clip = assembly.motion(assembly.assemble(config), "dance_3")
     assert np.isfinite(rollouts.psi_trajectory(inference.load(tmp_path / "out"), clip)).all()
-    with pytest.raises(ValueError, match="no garment called 'coat'"):
+    with pytest.raises(ValueError, match="coat: no such folder"):
         tune.main(["coat", "--out", str(tmp_path / "out")])
     with pytest.raises(ValueError, match=r"tuning\.steps is 0"):
         tune.main([str(tmp_path / "packed"), "--out", str(tmp_path / "none"), "--tuning.steps", "0"])
@@ -170,7 +170,7 @@ def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solver
 
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate.trained, "network", lambda _: (Config(), {}))
+    monkeypatch.setattr(trained, "network", lambda _: (Config(), {}))
     figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
 
     def measured(folder, motions):
