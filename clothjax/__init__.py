@@ -7,6 +7,7 @@ _HOMES = {
     "crowd": "runtime.inference",
     "initial_state": "runtime.inference",
     "load": "runtime.inference",
+    "load_motion": "files.storage",
     "Material": "types",
     "Model": "runtime.inference",
     "Motion": "types",

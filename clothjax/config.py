@@ -1,10 +1,13 @@
 """Every setting of an experiment, with its unit and default, as frozen dataclasses."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 # what joints from the wrists on are called, in lower case, by CMU and by SMPL
 HANDS = ("hand", "finger", "thumb", "wrist", "index", "middle", "pinky", "ring")
+
+
+ANYTHING = object()  # of a retired setting: whatever it was, it is no longer read
 
 
 def _require(condition: bool, message: str) -> None:
@@ -55,10 +58,6 @@ class PhysicsConfig:
     collision_stiffness: float = 1e5  # J/m^3, of the cubic penetration
     collision_offset: float = 3e-3  # m
     friction_coefficient: float = 0.5
-    friction_radius: float = 3e-3  # m, a distance (HOOD compares its square with this)
-    friction_smoothing: float = 1e-4  # m
-    flat_hinges: bool = True
-    """Bending is measured from flat, as in HOOD; false: from the canonical angle."""
     shaped_rest: bool = True
     """The rest shape follows the wearer's betas (a graded garment); false: always the template, as in HOOD."""
     contact_surface: Literal["triangles", "centroids"] = "triangles"
@@ -71,6 +70,8 @@ class PhysicsConfig:
     """Vertices of the garment keep away from its triangles."""
     self_offset: float = 2e-3  # m, the distance that they keep
     reach: float = 0.6  # m, body farther than this from the garment at rest is never searched
+
+    RETIRED: ClassVar[dict[str, Any]] = {"friction_radius": 3e-3, "friction_smoothing": 1e-4, "flat_hinges": True}
 
     def __post_init__(self):
         _require(
@@ -101,7 +102,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of (20)."""
+    """Weights w_k of the training loss sum_k w_k E_k / scale (METHOD.md, Training)."""
 
     stretching: Ramp = Ramp()
     bending: Ramp = Ramp()
@@ -147,12 +148,10 @@ class ModelConfig:
     processor: tuple[Stack, ...] = (Stack(("mesh", "coarse1"), 4),)
     body_nodes: Literal["updated", "encoded"] = "encoded"
     """Whether body nodes take part in message passing, or only send their encoding to the garment."""
-    body_radius: float = 0.03  # m, garment and body vertices closer than this are joined
     canonical_features: bool = True
     """Adds, to HOOD's features, the state seen from the canonical pose at the next frame."""
     convolution: tuple[Level, ...] = (Level(64), Level(64))
     convolution_bases: int = 8
-    residual_rate: float = 0.5
     latent: int = 400
     """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
     latent_update: Literal["absolute", "descent"] = "descent"
@@ -164,8 +163,6 @@ class ModelConfig:
     """Closed loops at whose ends the Hessian is taken whose mean preconditions the steps; 0: only that at rest."""
     descent_damping: float = 0.02
     """J, added to the Hessian of unit codes: folds are stiffer than its mean."""
-    descent_bound: float = 0.3
-    """Length in Z that a step cannot exceed."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
     decoder_skip: bool = True
@@ -174,13 +171,16 @@ class ModelConfig:
     blendshapes: int = 384
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
-    normalizer_steps: int = 2000
-    """Training steps over which the feature statistics are collected; then they are frozen."""
     remat: bool = False
     """Recompute each message-passing block in the backward pass: several times less memory, a little slower."""
-    bfloat16: bool = False
-    """Matrix products of encoding and message passing in bfloat16, where the device is faster at them: CPUs are not.
-    Parameters, and what passes from layer to layer, stay in float32."""
+
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "body_radius": 0.03,
+        "residual_rate": 0.5,
+        "descent_bound": 0.3,
+        "normalizer_steps": 2000,
+        "bfloat16": False,
+    }
 
     def __post_init__(self):
         _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")
@@ -205,13 +205,14 @@ class ShapesConfig:
     frames: int = 60
     descent_steps: int = 30
     """Conjugate-gradient steps of a frame."""
-    farthest: float = 0.4  # m, a sequence in which a vertex is displaced farther is left out
     seed: int = 0
+
+    RETIRED: ClassVar[dict[str, Any]] = {"farthest": 0.4}
 
 
 @dataclass(frozen=True)
-class Stage1Config:
-    """Training of Phi on the physics."""
+class PhysicsTrainingConfig:
+    """Training of a network on the physics, in rollouts of a pool of persistent simulations."""
 
     steps: int = 12000
     batch: int = 1
@@ -220,8 +221,8 @@ class Stage1Config:
     """Persistent simulations; `restart_probability: 1` with any pool is HOOD's restart curriculum."""
     restart_probability: float = 1.0 / 90.0
     lost: float | None = None
-    """A simulation whose loss is not below it is begun anew at its next turn, as are those of which a vertex is 5 m
-    from the body. Null: only these; an untrained Phi needs the time to mend its own."""
+    """Loss from which on a simulation is begun anew at its next turn, as are those with a vertex 5 m from the root.
+    Null: only these; an untrained Phi needs the time to mend its own."""
     rollout: int = 1
     """Frames of one update at the start ..."""
     rollout_end: int = 1
@@ -230,20 +231,15 @@ class Stage1Config:
     """Steps after which the rollout grows by one frame."""
     gradient_frames: int = 1
     """Frames of a rollout that gradients go through: 1 is HOOD's way, every frame's input state a constant."""
-    start_timestep: float = 1.0 / 3.0  # s, of the quasi-static first step (HOOD); 0: start as skinned
     learning_rate: float = 1e-3
     decay_start: float = 0.4
     """Fraction of the steps at full rate; then exponential decay ..."""
     decay_end: float = 0.03
     """... to this fraction of it."""
-    blendshape_rate: float = 0.0
-    """Learning rate of the blend shapes, relative. 0 keeps those that they start from: principal shapes that were
-    trained on reach less of what the cloth does on new motions."""
     adam_b2: float = 0.99
     clip: float = 1.0
     ema: float = 0.995
     """Decay per step of the averaged parameters that evaluation uses."""
-    betas: float = 2.0  # standard deviations, drawn uniformly from +-this
     seed: int = 0
 
     def __post_init__(self):
@@ -251,9 +247,19 @@ class Stage1Config:
 
 
 @dataclass(frozen=True)
-class TuningConfig(Stage1Config):
-    """Training of Psi on the physics after its regression: as stage 1, with Psi in the place of Phi. The bodies are
-    those of `stage1.betas`; `betas` here is not read."""
+class Stage1Config(PhysicsTrainingConfig):
+    """Training of Phi."""
+
+    start_timestep: float = 1.0 / 3.0  # s, of the quasi-static first step (HOOD); 0: start as skinned
+    blendshape_rate: float = 0.0
+    """Learning rate of the blend shapes, relative. 0 keeps those that they start from: principal shapes that were
+    trained on reach less of what the cloth does on new motions."""
+    betas: float = 2.0  # standard deviations, drawn uniformly from +-this
+
+
+@dataclass(frozen=True)
+class TuningConfig(PhysicsTrainingConfig):
+    """Fine-tuning of Psi after its regression, on the bodies of `stage1.betas`."""
 
     steps: int = 0
     pool: int = 192
@@ -263,17 +269,14 @@ class TuningConfig(Stage1Config):
     learning_rate: float = 1.5e-4
     clip: float = 1.5
     """Less than nearly every gradient, so that simulations count alike: soft cloth, and cloth in the body."""
-    start_timestep: float = 0.0
     preconditioning: float = 0.5
-    """Power of Phi's inverse Hessian, where `model.latent_update` is `descent`, that gradients of codes are multiplied
-    by, and of the poses' inverse covariance in those of the first layer; 0: none. The cloth is up to 4 000 times
-    stiffer along some codes, in standard deviations, than along others. With 1, errors of all would count alike, which
-    energies do not."""
+    """Power of the matrices that gradients are multiplied by; 0: none.
 
-    def __post_init__(self):
-        super().__post_init__()
-        _require(self.blendshape_rate == 0, "tuning does not train the blend shapes: set stage1.blendshape_rate")
-        _require(self.start_timestep == 0, "Psi does not know the time step: tuning.start_timestep must be 0")
+    They are Phi's inverse Hessian, where `model.latent_update` is `descent`, for gradients of codes, and the inverse
+    covariance of the poses for those of the first layer. The cloth is up to 4 000 times stiffer along some codes, in
+    standard deviations, than along others. With 1, errors of all would count alike, which energies do not."""
+
+    RETIRED: ClassVar[dict[str, Any]] = {"start_timestep": 0.0, "blendshape_rate": 0.0, "betas": ANYTHING}
 
 
 @dataclass(frozen=True)
@@ -295,21 +298,19 @@ class PeerConfig:
 
 @dataclass(frozen=True)
 class Stage2Config:
-    """Training of the latent predictor on the frozen teacher (21)."""
+    """Training of the latent predictor on the frozen teacher (METHOD.md, Training)."""
 
     steps: int = 6000
     batch: int = 32
     rollout: int = 16
     """Frames predicted in a row in one update."""
     noise: float = 0.3
-    """Standard deviation of the noise on Z_t, in standard deviations of Z."""
+    """Standard deviation of the noise on the first Z of a rollout, in standard deviations of Z."""
     vertex_share: float = 0.8
-    """Of the loss, taken by the error of the decoded vertices; the rest is that of the code (21). Both are shares of a
+    """Of the loss, taken by the error of the decoded vertices; the rest is that of the code. Both are shares of a
     variance, so that parts of the code that move nothing do not crowd out those that do."""
     latent_decay: float = 0.1
     """Part of Z forgotten in a frame unless the network gives it back: without it, the closed loop drifts."""
-    pushforward: bool = False
-    """Only the last frame of the rollout is trained, the others without gradient."""
     hidden: tuple[int, ...] = (512, 512)
     learning_rate: float = 1e-3
     clip: float = 1.0
@@ -320,6 +321,8 @@ class Stage2Config:
     excluded_joints: tuple[str, ...] = (*HANDS, "toe", "jaw", "eye")
     """Joints whose names contain one of these, in upper or lower case, are not inputs."""
     seed: int = 0
+
+    RETIRED: ClassVar[dict[str, Any]] = {"pushforward": False}
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 Array = jax.Array | np.ndarray
+Scalar = Float[Array, ""] | np.floating | float
 
 
 class Body(NamedTuple):

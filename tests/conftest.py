@@ -1,9 +1,13 @@
-"""JAX as strict as it can be, on the CPU."""
+"""JAX as strict as it can be, on the CPU; and fixtures of more than one folder."""
 
 import os
+import pickle
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before JAX is imported; child processes inherit it
 
@@ -30,3 +34,27 @@ def shared() -> Path:
     if not path.is_dir():
         pytest.skip("needs the reference data in ../shared")
     return path
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """A folder with the project in it, and what the commands of the documents call a user's own."""
+    import samples  # after the settings above
+
+    from clothjax.files import storage
+
+    folder = tmp_path_factory.mktemp("workplace")
+    for name in ("clothjax", "configs", "experiments", "data_prep"):
+        (folder / name).symlink_to(samples.ROOT / name)
+    for name, clip in {"my_walk": "walk_1", "my_run": "run_1", "my_take": "dance_1", "other": "walk_2"}.items():
+        shutil.copy(storage.asset(clip), folder / f"{name}.h5")
+    (folder / "02.asf").write_text(samples.ASF)
+    (folder / "02_01.amc").write_text(samples.AMC)
+    (folder / "walk.bvh").write_text(samples.BVH)
+    np.savez(folder / "02_01_poses.npz", **samples.recording())
+    (folder / "SMPL_FEMALE.pkl").write_bytes(pickle.dumps(samples.smpl_arrays(), protocol=2))
+    cloth = storage.load_garment("tshirt_1000", storage.load_body("body"))
+    trimesh.Trimesh(100 * np.asarray(cloth.vertices), np.asarray(cloth.faces), process=False).export(
+        folder / "shirt.obj"
+    )
+    return folder

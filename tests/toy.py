@@ -60,6 +60,7 @@ def untrained_psi(config: Config):
     import jax
     import jax.numpy as jnp
 
+    from clothjax.material import configured_material
     from clothjax.networks import decoder as garment_model
     from clothjax.networks import phi as compact_latent
     from clothjax.networks import psi as latent_predictor
@@ -72,9 +73,9 @@ def untrained_psi(config: Config):
     reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
     left, channels = compact_latent.latent_size(whole.scene, config.model)
     size = left * channels
-    kept = latent_predictor.kept_joints(whole.names, config.stage2)
+    kept = latent_predictor.input_joints(whole.names, config.stage2)
     count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
-    constants = latent_predictor.constant_inputs(jnp.zeros(10), experiment.material(config), config.material)
+    constants = latent_predictor.constant_inputs(jnp.zeros(10), configured_material(config), config.material)
     shapes = 0.1 * blendshapes.laplacian(whole.scene, config)
     garment = garment_model.init(jax.random.key(0), size, shapes, config.model)
     predictor = latent_predictor.init(jax.random.key(1), size, count, len(constants), config.stage2)

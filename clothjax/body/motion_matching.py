@@ -49,7 +49,9 @@ class Library(NamedTuple):
     fps: float
 
 
-def library(clips: Mapping[str, Motion], joints: np.ndarray, parents: Sequence[int], names: Sequence[str]) -> Library:
+def library(
+    clips: Mapping[str, Motion], joints: np.ndarray, parents: Sequence[int] | np.ndarray, names: Sequence[str]
+) -> Library:
     """A library of clips; clips whose names begin alike, up to a number, are a family ("walk_0", "walk_1").
 
     Args:
@@ -216,7 +218,7 @@ class Player:
             if ended or not allowed[self._now] or gain > WORTH:
                 self._transition(found)
             self._since = 0
-        self._now += clips.left[self._now] > 0
+        self._now += int(clips.left[self._now] > 0)
         self._advance(velocity, off, dt)
         pose = _by(self._joints, clips.rotations[self._now])
         step = _between(pose, self._shown)

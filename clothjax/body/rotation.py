@@ -1,11 +1,12 @@
 """Maps between representations of a 3-D rotation, finite with finite gradients at every angle."""
 
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from clothjax.types import Array
 
 
-def from_axis_angle(vector: Array) -> Array:
+def from_axis_angle(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     """Rotation matrices [..., 3, 3] from axis-angle vectors [..., 3] in radians (Rodrigues).
 
     Sine and cosine coefficients are switched to their series below 1e-3 rad, so the gradient at zero is finite.
@@ -26,12 +27,12 @@ def from_axis_angle(vector: Array) -> Array:
     return eye + sine[..., None, None] * cross + cosine[..., None, None] * (outer - squared[..., None, None] * eye)
 
 
-def to_6d(matrix: Array) -> Array:
-    """The first two columns of rotation matrices [..., 3, 3] as [..., 6] (3); Zhou et al. 2019."""
+def to_6d(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 6"]:
+    """The first two columns of rotation matrices [..., 3, 3] as [..., 6]; Zhou et al. 2019."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 
-def from_6d(code: Array, epsilon: float = 1e-12) -> Array:
+def from_6d(code: Float[Array, "*n 6"], epsilon: float = 1e-12) -> Float[Array, "*n 3 3"]:
     """Rotation matrices [..., 3, 3] from 6-D codes [..., 6] by Gram-Schmidt; finite for any input."""
     first, second = code[..., :3], code[..., 3:]
     x = _unit(first, epsilon)
@@ -39,7 +40,7 @@ def from_6d(code: Array, epsilon: float = 1e-12) -> Array:
     return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
 
 
-def heading(matrix: Array, epsilon: float = 1e-12) -> Array:
+def heading(matrix: Float[Array, "3 3"], epsilon: float = 1e-12) -> Float[Array, "3 3"]:
     """The rotation about +Y nearest to a rotation matrix [3, 3]: the direction its subject faces.
 
     It maximises trace(R_y^T R), so it commutes with turning the world about the vertical and is

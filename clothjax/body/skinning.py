@@ -3,24 +3,27 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from clothjax.types import Array, Body, Garment, Pose
 
 HIGHEST = jax.lax.Precision.HIGHEST  # positions are metres to a tenth of a millimetre: no reduced matmuls
 
 
-def shaped_joints(body: Body, betas: Array) -> Array:
+def shaped_joints(body: Body, betas: Float[Array, " S"]) -> Float[Array, "J 3"]:
     """Joints [J, 3] m of the body of shape `betas` [S], in the canonical pose."""
     return body.joints + jnp.einsum("jcs,s->jc", body.joint_shapedirs, betas, precision=HIGHEST)
 
 
-def shaped_vertices(wearable: Body | Garment, betas: Array) -> Array:
-    """Vertices T + G_S(beta) [N, 3] m of a body or garment of shape `betas` [S], in the canonical pose."""
+def shaped_vertices(wearable: Body | Garment, betas: Float[Array, " S"]) -> Float[Array, "N 3"]:
+    """Vertices [N, 3] m plus shape blend shapes, of a body or garment of shape `betas` [S], in the canonical pose."""
     return wearable.vertices + jnp.einsum("ncs,s->nc", wearable.shapedirs, betas, precision=HIGHEST)
 
 
-def forward_kinematics(rotations: Array, joints: Array, parents: np.ndarray) -> tuple[Array, Array]:
-    """Global rotations [J, 3, 3] and positions [J, 3] m of the joints, the root at its canonical place (2).
+def forward_kinematics(
+    rotations: Float[Array, "J 3 3"], joints: Float[Array, "J 3"], parents: Int[Array, " J"]
+) -> tuple[Float[Array, "J 3 3"], Float[Array, "J 3"]]:
+    """Global rotations [J, 3, 3] and positions [J, 3] m of the joints, the root at its canonical place.
 
     Args:
         rotations: [J, 3, 3] local to the parent.
@@ -42,34 +45,38 @@ def forward_kinematics(rotations: Array, joints: Array, parents: np.ndarray) -> 
     return turn, position
 
 
-def joint_transforms(rotations: Array, joints: Array, parents: np.ndarray) -> Array:
-    """L_k of (2) as [J, 3, 4]: forward kinematics after the inverse bind matrices (translations in m)."""
+def joint_transforms(
+    rotations: Float[Array, "J 3 3"], joints: Float[Array, "J 3"], parents: Int[Array, " J"]
+) -> Float[Array, "J 3 4"]:
+    """Transforms [R_j | q_j - R_j J_j] as [J, 3, 4]: forward kinematics after the inverse bind matrices (m)."""
     return bound_transforms(*forward_kinematics(rotations, joints, parents), joints)
 
 
-def bound_transforms(turn: Array, position: Array, joints: Array) -> Array:
-    """L_k of (2) as [J, 3, 4] from global rotations [J, 3, 3] and positions [J, 3] m, and canonical joints [J, 3] m."""
+def bound_transforms(
+    turn: Float[Array, "J 3 3"], position: Float[Array, "J 3"], joints: Float[Array, "J 3"]
+) -> Float[Array, "J 3 4"]:
+    """`joint_transforms` from global rotations R [J, 3, 3], positions q [J, 3] m and canonical joints J [J, 3] m."""
     offset = position - jnp.einsum("jab,jb->ja", turn, joints, precision=HIGHEST)
     return jnp.concatenate([turn, offset[:, :, None]], axis=-1)
 
 
-def blend(weights: Array, transforms: Array) -> Array:
-    """Per-vertex transforms [N, 3, 4], the weighted sum of (1), from weights [N, J] and transforms [J, 3, 4]."""
+def blend(weights: Float[Array, "N J"], transforms: Float[Array, "J 3 4"]) -> Float[Array, "N 3 4"]:
+    """Per-vertex transforms sum_j w_ij T_j [N, 3, 4], from weights w [N, J] and transforms T [J, 3, 4]."""
     flat = jnp.matmul(weights, transforms.reshape(transforms.shape[0], 12), precision=HIGHEST)
     return flat.reshape(weights.shape[0], 3, 4)
 
 
-def apply(transforms: Array, points: Array) -> Array:
+def apply(transforms: Float[Array, "N 3 4"], points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
     """Points [N, 3] m moved by their own transforms [N, 3, 4]."""
     return jnp.einsum("nab,nb->na", transforms[:, :, :3], points, precision=HIGHEST) + transforms[:, :, 3]
 
 
-def unapply(transforms: Array, points: Array) -> Array:
+def unapply(transforms: Float[Array, "N 3 4"], points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
     """The inverse of `apply`: canonical points [N, 3] m of posed points [N, 3] m."""
     return unapply_direction(transforms, points - transforms[:, :, 3])
 
 
-def unapply_direction(transforms: Array, vectors: Array) -> Array:
+def unapply_direction(transforms: Float[Array, "N 3 4"], vectors: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
     """Vectors [N, 3] carried back by the linear part of the transforms [N, 3, 4] (Cramer's rule).
 
     Blended matrices can be near singular (a joint folded by pi); the determinant is kept away from zero.
@@ -81,14 +88,16 @@ def unapply_direction(transforms: Array, vectors: Array) -> Array:
     return jnp.einsum("nab,nb->na", rows, vectors, precision=HIGHEST) / safe[:, None]
 
 
-def pose_body(body: Body, vertices: Array, joints: Array, pose: Pose) -> Array:
+def pose_body(
+    body: Body, vertices: Float[Array, "B 3"], joints: Float[Array, "J 3"], pose: Pose
+) -> Float[Array, "B 3"]:
     """Posed vertices [B, 3] m of a body shaped to `vertices` [B, 3] and `joints` [J, 3], translation included."""
     transforms = joint_transforms(pose.rotations, joints, body.parents)
     moved = apply(blend(body.weights, transforms), pose_corrected(body, vertices, pose))
     return moved + pose.translation[None]
 
 
-def pose_corrected(body: Body, vertices: Array, pose: Pose) -> Array:
+def pose_corrected(body: Body, vertices: Float[Array, "B 3"], pose: Pose) -> Float[Array, "B 3"]:
     """Canonical vertices [B, 3] m with SMPL's pose blend shapes added, where the body has them."""
     if body.posedirs is None:
         return vertices
@@ -96,7 +105,7 @@ def pose_corrected(body: Body, vertices: Array, pose: Pose) -> Array:
     return vertices + jnp.einsum("ncp,p->nc", body.posedirs, features, precision=HIGHEST)
 
 
-def vertex_normals(vertices: Array, faces: Array) -> Array:
+def vertex_normals(vertices: Float[Array, "N 3"], faces: Int[Array, "F 3"]) -> Float[Array, "N 3"]:
     """Area-weighted unit normals [N, 3] of vertices [N, 3] m; zero where a vertex has no area around it."""
     corners = vertices[faces]
     face_normals = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

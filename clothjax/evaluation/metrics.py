@@ -16,7 +16,6 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.geometry import topology
-from clothjax.networks import decoder
 from clothjax.physics import descent, energies, incremental_potential, solver
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.simulation import characters, time_step
@@ -107,7 +106,7 @@ def _search_span(scene: Scene, character: Character, blendshapes: Array, config:
 
         def garment(weights):
             displacement = jnp.matmul(weights, vectors, precision="highest").reshape(-1, 3)
-            return decoder.vertices(displacement, character.template, transforms)
+            return skinning.apply(transforms, character.template + displacement)
 
         def potential(new):
             return incremental_potential.potential(new, step, scene.mesh, config.physics)
@@ -209,7 +208,7 @@ def edge_strain(scene: Scene, character: Character, trajectory: Array) -> dict[s
 
 
 def beside_solver(scene: Scene, trajectory: Array, solved: Array, skinned: Array) -> dict[str, float]:
-    """How a trajectory compares with the reference solver's own closed loop, frame by frame.
+    """How a trajectory compares with the reference solver's own rollout, frame by frame.
 
     Args:
         trajectory, solved, skinned: [T, V, 3] m at the same frames, relative to the root.

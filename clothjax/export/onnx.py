@@ -130,7 +130,7 @@ def _sound(g: Graph, count: int) -> tuple[str, str, str]:
 
 
 def _chain(g: Graph, local: str, joints: Array, parents: Array) -> str:
-    """Skinning transforms (2) [N, J + 1, 4, 4] of local rotations [N, J, 3, 3], the last the identity.
+    """Skinning transforms [R | q - R J] as [N, J + 1, 4, 4] of local rotations [N, J, 3, 3], the last the identity.
 
     Pointer jumping, as in `skinning.forward_kinematics`.
     """

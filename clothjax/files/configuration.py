@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import yaml
 
+from clothjax.config import ANYTHING
+
 Config = TypeVar("Config")
 Sources = dict[str, tuple[str, ...]]  # dotted path of a value -> the files that set it or parts of it
 
@@ -43,6 +45,8 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
 def cli(cls: type[Config], argv: Sequence[str]) -> Config:
     """The configuration that a command line asks for: a YAML file, then overrides such as `--train.seed 3`.
 
+    Without a file, the overrides change the defaults of `cls`.
+
     Args:
         argv: the arguments, without the program's name. `--help` alone lists every setting with its default.
     """
@@ -51,10 +55,12 @@ def cli(cls: type[Config], argv: Sequence[str]) -> Config:
             return load(cls, argv[0], argv[1:])
         except ValueError as error:
             sys.exit(str(error))
-    usage = "CONFIG.yaml [--SETTING VALUE ...]"
+    usage = "[CONFIG.yaml] [--SETTING VALUE ...]"
     if {"-h", "--help"} & set(argv):
         return _override(cls, cls(), ["--help"], prog=usage)
-    sys.exit(f"the first argument must be a configuration file: {usage}; `--help` lists the settings")
+    if not argv:
+        sys.exit(f"give a configuration file, settings, or both: {usage}; `--help` lists the settings")
+    return _override(cls, cls(), argv, prog=usage)
 
 
 def to_dict(config: Any) -> Any:
@@ -165,6 +171,11 @@ def _build(cls: type, values: Any, path: str, sources: Sources, default: str) ->
     if not isinstance(values, Mapping):
         _fail(f"expected a mapping of settings, got {values!r}", path, sources, default)
     fields = {f.name: f for f in dataclasses.fields(cls)}
+    retired = getattr(cls, "RETIRED", {})
+    for key in set(values) & set(retired):
+        if retired[key] is not ANYTHING and values[key] != retired[key]:
+            _fail(f"is no longer a setting, it is always {retired[key]!r}", _join(path, key), sources, default)
+    values = {key: value for key, value in values.items() if key not in retired}
     for key in values:
         if key not in fields:
             near = difflib.get_close_matches(str(key), fields, 1)

@@ -1,4 +1,4 @@
-"""From a latent code to vertices: decoder, learnable blend shapes, skinning (17)-(19). Shared by Phi and Psi."""
+"""From a latent code to vertices (METHOD.md, Decoder): decoder, blend shapes, skinning. Shared by Phi and Psi."""
 
 import flax.linen as nn
 import jax
@@ -35,7 +35,7 @@ def blend_weights(params: Params, latent: Array, config: ModelConfig) -> Array:
 
 
 def displacement(params: Params, latent: Array, free: Array, config: ModelConfig) -> Array:
-    """Canonical displacement [V, 3] m of a latent code [L] (19); zero where `free` [V] is zero (pins)."""
+    """Canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is zero (pins)."""
     weights = blend_weights(params, latent, config)
     shapes = params["blendshapes"]
     flat = jnp.matmul(weights, shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST)
@@ -43,5 +43,5 @@ def displacement(params: Params, latent: Array, free: Array, config: ModelConfig
 
 
 def vertices(displaced: Array, template: Array, transforms: Array) -> Array:
-    """Garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4] (17)."""
+    """Garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4]."""
     return skinning.apply(transforms, template + displaced)

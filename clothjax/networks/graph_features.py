@@ -15,6 +15,8 @@ from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array, ClothState, Contact
 
+BODY_RADIUS = 0.03  # m, garment and body vertices closer than this are joined
+
 
 class WorldFeatures(NamedTuple):
     """Of the body: nodes, and pairs of a garment vertex with the body vertex nearest to it."""
@@ -46,7 +48,7 @@ def compute(
     model: ModelConfig,
     material: MaterialConfig,
 ) -> Features:
-    """The inputs of Phi for one step: HOOD's, plus positions and accelerations (method: X_H+).
+    """The inputs of Phi for one step: HOOD's, plus positions and accelerations (METHOD.md, Phi).
 
     Args:
         contact: planes at the body points nearest to the garment now; None where there is no body.
@@ -83,12 +85,12 @@ def compute(
     }
     world = None
     if contact is not None:
-        world = _world(state, window, contact, timestep, node, inputs, extra.shape[-1], model.body_radius)
+        world = _world(state, window, contact, timestep, node, inputs, extra.shape[-1])
     return Features(jnp.concatenate([garment, extra], axis=-1), edges, world)
 
 
 def _world(
-    state: ClothState, window: Window, contact: Contact, timestep: Array, node, inputs: Array, extra: int, radius: float
+    state: ClothState, window: Window, contact: Contact, timestep: Array, node, inputs: Array, extra: int
 ) -> WorldFeatures:
     """Of the body, as the garment's: `node` makes rows, which get `extra` columns of zeros."""
     bodies = [frame.body for frame in window]
@@ -108,7 +110,7 @@ def _world(
     return WorldFeatures(
         nodes=jnp.pad(nodes, ((0, 0), (0, extra))),
         slots=slots,
-        active=jnp.sum(offset_now * offset_now, axis=-1) <= radius**2,
+        active=jnp.sum(offset_now * offset_now, axis=-1) <= BODY_RADIUS**2,
         to_garment=to_garment,
         to_body=to_body,
     )

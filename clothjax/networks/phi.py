@@ -1,4 +1,4 @@
-"""Phi: Encode, Process, Convolve, Decode (18). From a garment's state to the latent code of its next frame."""
+"""Phi (METHOD.md, Phi): encode, process, convolve, decode. From a garment's state to the code of its next frame."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from clothjax.body import skinning
 from clothjax.config import MaterialConfig, ModelConfig
-from clothjax.networks import decoder, graph_features, mesh_convolution, message_passing, mlp, normalisation
+from clothjax.networks import decoder, graph_features, mesh_convolution, message_passing, normalisation
 from clothjax.networks.graph_features import Features, WorldFeatures
 from clothjax.networks.mlp import Params, apply_mlp, dense, init_dense, init_mlp
 from clothjax.networks.normalisation import Statistics
@@ -18,6 +18,7 @@ from clothjax.simulation.scene import Scene
 from clothjax.types import Array
 
 TYPE_EMBEDDING, LEVEL_EMBEDDING = 9, 4
+DESCENT_BOUND = 0.3  # of a step of the descent, in Z
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
@@ -48,7 +49,6 @@ def init(key: Array, scene: Scene, example: Features, basis: Array, config: Mode
                 channels,
                 level.features or per_vertex,
                 config.convolution_bases,
-                config.residual_rate,
             )
         )
         channels = level.features
@@ -106,8 +106,6 @@ def pass_messages(
     config: ModelConfig,
 ) -> Array:
     """Encode and Process: node latents [V, W] of the garment from features."""
-    if config.bfloat16:
-        params = mlp.in_bfloat16(params)
     encoder = params["encoder"]
     pinned = scene.garment.pinned.astype(jnp.int32)
     kinds = params["type_embedding"]
@@ -157,7 +155,6 @@ def convolve(params: Params, scene: Scene, processed: Array, config: ModelConfig
             processed,
             table.ids,
             table.mask,
-            residual_rate=config.residual_rate,
             activation=jax.nn.relu,
         )
     if "latent" in params:
@@ -187,7 +184,7 @@ def step(
             return jnp.matmul(fixed["inverse_hessian"], gradient, precision="highest")
 
         start = warm_start(now, change, garment, potential)
-        guess = descend(precondition, start, garment, potential, model.descent_steps, model.descent_bound)
+        guess = descend(precondition, start, garment, potential, model.descent_steps, DESCENT_BOUND)
         guessed = garment(guess)
     else:
         guess = 0.0

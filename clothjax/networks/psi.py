@@ -1,4 +1,4 @@
-"""Psi's network: the next latent code from the current one and what a game engine knows (method section 5)."""
+"""Psi's network (METHOD.md, Psi): the next latent code from the current one and what a game engine knows."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def input_joints(names: tuple[str, ...], config: Stage2Config) -> np.ndarray:
 
 
 def pose_inputs(rotations: Array, positions: Array, advance: Array, kept: np.ndarray, fps: float) -> Array:
-    """What X_c holds of the motion, [6 + 3 * 6 * Jk + 3 * 3 * (Jk - 1)], without place or heading.
+    """Psi's inputs from the motion, [6 + 3 * 6 * Jk + 3 * 3 * (Jk - 1)], without place or heading.
 
     Args:
         rotations: [3, J, 3, 3] local, at t + 1, t, t - 1.

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Int
 
 from clothjax.geometry.proximity import (
     Patches,
@@ -19,7 +20,13 @@ WOUND = 0.25  # the least of it that does: it is 0 outside, 1 inside, and half o
 LEVEL = 1e-4  # m, planes that differ by less are one
 
 
-def find(positions: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None = None) -> Contact:
+def find(
+    positions: Float[Array, "V 3"],
+    body: Float[Array, "B 3"],
+    body_next: Float[Array, "B 3"],
+    patches: Patches,
+    ahead: Float[Array, "V 3"] | None = None,
+) -> Contact:
     """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
 
     The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
@@ -39,7 +46,12 @@ def find(positions: Array, body: Array, body_next: Array, patches: Patches, ahea
 
 
 def _planes(
-    positions: Array, face: Array, body: Array, body_next: Array, patches: Patches, ahead: Array | None
+    positions: Float[Array, "V 3"],
+    face: Int[Array, " V"],
+    body: Float[Array, "B 3"],
+    body_next: Float[Array, "B 3"],
+    patches: Patches,
+    ahead: Float[Array, "V 3"] | None,
 ) -> Contact:
     """As `find`, with the nearest triangles [V] known."""
     faces, corners = patches.faces, body[patches.faces]
@@ -71,13 +83,13 @@ def _planes(
 
 
 def find_at_edges(
-    positions: Array,
+    positions: Float[Array, "V 3"],
     planes: Contact,
     mesh: Mesh,
-    body: Array,
-    body_next: Array,
+    body: Float[Array, "B 3"],
+    body_next: Float[Array, "B 3"],
     patches: Patches,
-    ahead: Array | None = None,
+    ahead: Float[Array, "V 3"] | None = None,
 ) -> EdgeContact:
     """The contact of each edge where it comes nearest to the body between its ends, whose planes are `planes`.
 
@@ -110,7 +122,7 @@ def find_at_edges(
     return EdgeContact(place, found.point_next, found.normal_next)
 
 
-def find_on_self(positions: Array, patches: Patches) -> SelfContact:
+def find_on_self(positions: Float[Array, "V 3"], patches: Patches) -> SelfContact:
     """The nearest point of the garment [V, 3] m to each of its vertices, on triangles that it is no corner of."""
     positions, patches = jax.tree.map(jnp.asarray, (positions, patches))
     corners = positions[patches.faces]
@@ -125,7 +137,9 @@ def find_on_self(positions: Array, patches: Patches) -> SelfContact:
     return SelfContact(patches.faces[face], weights, jax.lax.stop_gradient(normal))
 
 
-def find_at_centroids(positions: Array, body: Array, body_next: Array, faces: Array) -> Contact:
+def find_at_centroids(
+    positions: Float[Array, "V 3"], body: Float[Array, "B 3"], body_next: Float[Array, "B 3"], faces: Int[Array, "F 3"]
+) -> Contact:
     """The planes of the body's faces [F, 3] whose centroids are nearest to positions [V, 3] m, as in HOOD.
 
     Args:
@@ -136,13 +150,17 @@ def find_at_centroids(positions: Array, body: Array, body_next: Array, faces: Ar
     return Contact(point[face], point_next[face], normal[face], normal_next[face], nearest_point(positions, body))
 
 
-def centroids(vertices: Array, faces: Array) -> tuple[Array, Array]:
+def centroids(
+    vertices: Float[Array, "B 3"], faces: Int[Array, "F 3"]
+) -> tuple[Float[Array, "F 3"], Float[Array, "F 3"]]:
     """Centroids [F, 3] m and unit normals [F, 3] of the faces of a body [B, 3] m."""
     corners = vertices[faces]
     return jnp.mean(corners, axis=1), _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
-def distance(positions: Array, points: Array, normals: Array) -> Array:
+def distance(
+    positions: Float[Array, "*n 3"], points: Float[Array, "*n 3"], normals: Float[Array, "*n 3"]
+) -> Float[Array, "*n"]:
     """Signed distance [V] m of positions [V, 3] m to their planes, positive outside."""
     return jnp.sum((positions - points) * normals, axis=-1)
 

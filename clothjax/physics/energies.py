@@ -8,8 +8,9 @@ slip.
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
-from clothjax.types import Array, Mesh, Rest
+from clothjax.types import Array, Mesh, Rest, Scalar
 
 GRAVITY = 9.81  # m/s^2
 THICKNESS = 4.7e-4  # m, of the StVK membrane, HOOD and SNUG
@@ -17,7 +18,7 @@ SLIVER = 1e-6  # of a hinge's squared size, twice the area of a face that has no
 COLLISION_OFFSET = 3e-3  # m, the cloth is pushed out to this distance from the body
 
 
-def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:
+def rest_measures(vertices: Float[Array, "V 3"], mesh: Mesh, flat: bool = True) -> Rest:
     """Rest measures of a garment from its canonical vertices [V, 3] m.
 
     With `flat` the rest angle of every hinge is zero, as in HOOD; otherwise it is the canonical one.
@@ -42,14 +43,16 @@ def rest_measures(vertices: Array, mesh: Mesh, flat: bool = True) -> Rest:
     )
 
 
-def vertex_areas(vertices: Array, faces: Array) -> Array:
+def vertex_areas(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Float[Array, " V"]:
     """Area [V] m^2 that belongs to each vertex [V, 3] m: a third of its faces [F, 3]."""
     corners = vertices[faces]
     areas = 0.5 * _norm(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     return jnp.zeros_like(vertices[:, 0]).at[faces.reshape(-1)].add(jnp.repeat(areas / 3.0, 3))
 
 
-def regional(rest: Rest, areas: Array, mesh: Mesh, cloth: Array) -> tuple[Rest, Array]:
+def regional(
+    rest: Rest, areas: Float[Array, " V"], mesh: Mesh, cloth: Float[Array, "V 3"]
+) -> tuple[Rest, Float[Array, " V"]]:
     """Rest measures and areas [V] of cloth that is not the same everywhere.
 
     The measures of an element weigh its energy, so they stand for how much of the material is there.
@@ -64,7 +67,7 @@ def regional(rest: Rest, areas: Array, mesh: Mesh, cloth: Array) -> tuple[Rest, 
     ), areas * cloth[:, 0]
 
 
-def green_strain(corners: Array, inverse: Array) -> Array:
+def green_strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> Float[Array, "F 2 2"]:
     """Green strain [F, 2, 2] of posed triangles [F, 3, 3] m with inverse rest edge matrices [F, 2, 2]."""
     edges = jnp.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=-1)
     gradient = jnp.einsum("fab,fbc->fac", edges, inverse)
@@ -72,14 +75,21 @@ def green_strain(corners: Array, inverse: Array) -> Array:
     return 0.5 * (metric - jnp.eye(2, dtype=corners.dtype)[None])
 
 
-def stretching(corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=THICKNESS) -> Array:
+def stretching(
+    corners: Float[Array, "F 3 3"],
+    inverse: Float[Array, "F 2 2"],
+    area: Float[Array, " F"],
+    mu: Scalar,
+    lam: Scalar,
+    thickness: float = THICKNESS,
+) -> Float[Array, " F"]:
     """Saint Venant-Kirchhoff energy [F] J: A h (mu tr(G^2) + lambda/2 tr(G)^2) of triangles [F, 3, 3] m."""
     strain = green_strain(corners, inverse)
     trace = strain[:, 0, 0] + strain[:, 1, 1]
     return area * thickness * (mu * jnp.sum(strain * strain, axis=(1, 2)) + 0.5 * lam * trace * trace)
 
 
-def dihedral_angle(corners: Array) -> Array:
+def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 if flat, or where a face has hardly any area."""
     offsets = corners[:, 1:] - corners[:, :1]
     # the angle has no size, what it is made of is of fifth order in length: that would underflow in float32
@@ -98,30 +108,39 @@ def dihedral_angle(corners: Array) -> Array:
     return jnp.where(degenerate, 0.0, jnp.arctan2(sine / scale, jnp.where(degenerate, 1.0, cosine / scale)))
 
 
-def bending(corners: Array, area: Array, rest_angle: Array, stiffness: Array) -> Array:
+def bending(
+    corners: Float[Array, "H 4 3"], area: Float[Array, " H"], rest_angle: Float[Array, " H"], stiffness: Scalar
+) -> Float[Array, " H"]:
     """Dihedral energy [H] J: k l^2 / (4 A) (theta - theta_0)^2 / 2, l the current edge, A the rest area."""
     edge = corners[:, 1] - corners[:, 0]
     angle = dihedral_angle(corners) - rest_angle
     return stiffness * jnp.sum(edge * edge, axis=-1) / (8.0 * area) * angle * angle
 
 
-def gravity(height: Array, mass: Array) -> Array:
+def gravity(height: Float[Array, " V"], mass: Float[Array, " V"]) -> Float[Array, " V"]:
     """Potential energy [V] J of masses [V] kg raised by `height` [V] m."""
     return GRAVITY * mass * height
 
 
-def inertia(deviation: Array, mass: Array, timestep: Array) -> Array:
-    """Incremental kinetic potential [V] J (16): m |x - x_t - v_t|^2 / (2 dt^2) of the deviation, m."""
+def inertia(deviation: Float[Array, "V 3"], mass: Float[Array, " V"], timestep: Scalar) -> Float[Array, " V"]:
+    """Incremental kinetic potential [V] J: m |x - x_t - v_t|^2 / (2 dt^2) of the deviation x - x_t - v_t, m."""
     return mass * jnp.sum(deviation * deviation, axis=-1) / (2.0 * timestep * timestep)
 
 
-def collision(distance: Array, offset=COLLISION_OFFSET) -> Array:
+def collision(distance: Float[Array, "*n"], offset: float = COLLISION_OFFSET) -> Float[Array, "*n"]:
     """Cubic penetration max(offset - d, 0)^3 [V] m^3 at signed distances [V] m; times a stiffness, J/m^3."""
     depth = jnp.maximum(offset - distance, 0.0)
     return depth * depth * depth
 
 
-def friction(slip: Array, normal: Array, mass: Array, touching: Array, coefficient=0.5, smoothing=1e-4) -> Array:
+def friction(
+    slip: Float[Array, "V 3"],
+    normal: Float[Array, "V 3"],
+    mass: Float[Array, " V"],
+    touching: Bool[Array, " V"],
+    coefficient: float = 0.5,
+    smoothing: float = 1e-4,
+) -> Float[Array, " V"]:
     """HOOD's friction potential [V] J: c g m kappa |tau| where a vertex touches the body.
 
     tau is the slip [V, 3] m relative to the body without its part along the contact normal [V, 3], and
@@ -138,12 +157,12 @@ def friction(slip: Array, normal: Array, mass: Array, touching: Array, coefficie
     return jnp.where(touching, coefficient * GRAVITY * mass * kappa * distance, 0.0)
 
 
-def _norm(vector: Array) -> Array:
+def _norm(vector: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     squared = jnp.sum(vector * vector, axis=-1)
     zero = squared == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
-def _triangle_areas(hinges: Array) -> Array:
+def _triangle_areas(hinges: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     a, b, c, d = hinges[:, 0], hinges[:, 1], hinges[:, 2], hinges[:, 3]
     return 0.5 * (_norm(jnp.cross(b - a, c - a)) + _norm(jnp.cross(b - a, d - a)))

@@ -1,13 +1,18 @@
-"""The incremental potential of one time step: its terms, and their weighted sum (20)."""
+"""The incremental potential of one time step (METHOD.md, Incremental potential): its terms, and their weighted sum."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search
 from clothjax.physics.energies import bending, collision, friction, gravity, inertia, stretching
 from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, SelfContact
+
+FRICTION_RADIUS = 3e-3  # m, a distance (HOOD compares its square with this)
+FRICTION_SMOOTHING = 1e-4  # m
 
 
 class TimeStep(NamedTuple):
@@ -25,12 +30,24 @@ class TimeStep(NamedTuple):
     self_contact: SelfContact | None = None
 
 
-def touching(position: Array, contact: Contact, radius: float) -> Array:
-    """Whether each vertex [V, 3] m is within `radius` m of its contact plane."""
-    return contact_search.distance(position, contact.point, contact.normal) < radius
+class Laws(NamedTuple):
+    """Energy laws that a comparison with another solver may replace. Static: they are part of a compiled program."""
+
+    stretching: Callable = stretching
+    collision: Callable = collision
 
 
-def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+LAWS = Laws()
+
+
+def touching(position: Float[Array, "V 3"], contact: Contact) -> Bool[Array, " V"]:
+    """Return bool [V]: which vertices [V, 3] m are within `FRICTION_RADIUS` of their contact planes."""
+    return contact_search.distance(position, contact.point, contact.normal) < FRICTION_RADIUS
+
+
+def elements(
+    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
+) -> dict[str, Array]:
     """Every term of the incremental potential at new positions [V, 3] m, element by element, in J.
 
     The sums of these are what training minimises and what the reference solver minimises: there is no other energy.
@@ -38,7 +55,7 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
     moved = new - step.position
     contact = step.contact
     terms = {
-        "stretching": stretching(
+        "stretching": laws.stretching(
             new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
         ),
         "bending": bending(new[mesh.hinges], step.rest.hinge_area, step.rest.hinge_angle, step.material.bending),
@@ -48,7 +65,7 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
     }
     if contact is not None:
         gap = contact_search.distance(new, contact.point_next, contact.normal_next)
-        terms["collision"] = config.collision_stiffness * collision(gap, config.collision_offset)
+        terms["collision"] = config.collision_stiffness * laws.collision(gap, config.collision_offset)
     if step.touching is not None:
         normal = contact.normal + contact.normal_next
         length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
@@ -58,37 +75,43 @@ def elements(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> d
             step.mass,
             step.touching,
             config.friction_coefficient,
-            config.friction_smoothing,
+            FRICTION_SMOOTHING,
         )
     if step.edge_contact is not None:
-        terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config)
+        terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config, laws)
     if step.self_contact is not None:
         points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
-        terms["self_collision"] = self_collision(points, step.self_contact, config)
+        terms["self_collision"] = self_collision(points, step.self_contact, config, laws)
     return {name: values for name, values in terms.items() if name not in config.without}
 
 
-def edge_collision(ends: Array, contact: EdgeContact, config: PhysicsConfig) -> Array:
+def edge_collision(
+    ends: Float[Array, "*n 2 3"], contact: EdgeContact, config: PhysicsConfig, laws: Laws = LAWS
+) -> Float[Array, "*n"]:
     """Collision energy [...] J of edges [..., 2, 3] m at the places that touch."""
     start, end = ends[..., 0, :], ends[..., 1, :]
     # differences first: far from the origin the place itself is coarse
     offset = (start - contact.point_next) + contact.place[..., None] * (end - start)
     distance = jnp.sum(offset * contact.normal_next, axis=-1)
-    return config.collision_stiffness * collision(distance, config.collision_offset)
+    return config.collision_stiffness * laws.collision(distance, config.collision_offset)
 
 
-def self_collision(points: Array, contact: SelfContact, config: PhysicsConfig) -> Array:
+def self_collision(
+    points: Float[Array, "*n 4 3"], contact: SelfContact, config: PhysicsConfig, laws: Laws = LAWS
+) -> Float[Array, "*n"]:
     """Collision energy [...] J of vertices and the corners of the triangles they may touch [..., 4, 3] m."""
     offset = jnp.sum(contact.weights[..., :, None] * (points[..., :1, :] - points[..., 1:, :]), axis=-2)
     distance = jnp.sum(offset * contact.normal, axis=-1)
-    return config.collision_stiffness * collision(distance, config.self_offset)
+    return config.collision_stiffness * laws.collision(distance, config.self_offset)
 
 
-def energies(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+def energies(
+    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
+) -> dict[str, Array]:
     """The terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
-    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config).items()}
+    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws).items()}
 
 
-def potential(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
-    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises (11)."""
+def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Float[Array, ""]:
+    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises."""
     return sum(energies(new, step, mesh, config).values())

@@ -14,7 +14,7 @@ import scipy.sparse
 
 from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search, energies, incremental_potential
-from clothjax.physics.incremental_potential import TimeStep
+from clothjax.physics.incremental_potential import LAWS, Laws, TimeStep
 from clothjax.types import Array, Mesh
 
 VERTEX_TERMS = ("gravity", "inertia", "friction", "collision")
@@ -90,8 +90,9 @@ def solve_step(
     *,
     tolerance: float = TOLERANCE,
     max_iterations: int = 500,
+    laws: Laws = LAWS,
 ) -> tuple[np.ndarray, SolverInfo]:
-    """The positions that minimise `losses.potential` over the vertices that are not pinned (11).
+    """The positions that minimise `incremental_potential.potential` over the vertices that are not pinned.
 
     Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned
     by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The
@@ -106,6 +107,7 @@ def solve_step(
         tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the
             norm of their weights. This does not depend on the start, where penetration can make any force.
         max_iterations: Newton iterations.
+        laws: of stretching and collision; others than the default are for comparisons.
 
     Returns:
         Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met, `ok`
@@ -123,11 +125,11 @@ def solve_step(
     weight = max(float(np.linalg.norm(energies.GRAVITY * step.mass[free[:, 0]])), np.finfo(np.float64).tiny)
 
     with jax.enable_x64(True):
-        evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config)
+        evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config, laws=laws)
         energy, gradient, _ = _host(evaluate(x), free)
         iterations = 0
         while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
-            exact, semidefinite = hessians(x, step, mesh, pattern, config)
+            exact, semidefinite = hessians(x, step, mesh, pattern, config, laws)
             if not (np.isfinite(exact).all() and np.isfinite(semidefinite).all()):
                 break
             # inexact far away, more exact as the gradient falls: the last iterations converge superlinearly
@@ -151,33 +153,33 @@ def _present(step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[TimeSte
 
 
 def hessians(
-    x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig
+    x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig, laws: Laws = LAWS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks [N, 3, 3] N/m of the exact Hessian of `losses.potential` at [V, 3] m, and of a semidefinite one.
+    """Blocks [N, 3, 3] N/m of the exact Hessian of the potential at [V, 3] m, and of a semidefinite one.
 
     The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the
     square of the residual's gradient (Gauss-Newton); of terms of single vertices, the positive eigenvalues.
     """
     return tuple(
         (pattern.gather @ np.asarray(blocks).reshape(-1, 9)).reshape(-1, 3, 3)
-        for blocks in _element_hessians(x, step, mesh, config)
+        for blocks in _element_hessians(x, step, mesh, config, laws)
     )
 
 
-@partial(jax.jit, static_argnames="config")
-def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[Array, Array]:
+@partial(jax.jit, static_argnames=("config", "laws"))
+def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws) -> tuple[Array, Array]:
     """Blocks [P, 3, 3] N/m of all pairs of corners of all elements, in the order of `_corners`: exact, semidefinite."""
     rest, material = step.rest, step.material
     corners, hinges = x[mesh.faces], x[mesh.hinges]
 
     def face_energy(points, inverse, area):
-        return energies.stretching(points[None], inverse[None], area[None], material.mu, material.lam)[0]
+        return laws.stretching(points[None], inverse[None], area[None], material.mu, material.lam)[0]
 
     def hinge_energy(points, area, angle):
         return energies.bending(points[None], area[None], angle[None], material.bending)[0]
 
     def vertex_energy(new):
-        elements = incremental_potential.elements(new, step, mesh, config)
+        elements = incremental_potential.elements(new, step, mesh, config, laws)
         return sum((jnp.sum(elements[name]) for name in VERTEX_TERMS if name in elements), jnp.zeros((), x.dtype))
 
     vertex_gradient = jax.grad(vertex_energy)
@@ -202,10 +204,10 @@ def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfi
     # the last two are convex
     convex = []
     if step.edge_contact is not None:
-        energy = partial(incremental_potential.edge_collision, config=config)
+        energy = partial(incremental_potential.edge_collision, config=config, laws=laws)
         convex.append(jax.vmap(jax.hessian(energy))(x[mesh.edges], step.edge_contact))
     if step.self_contact is not None:
-        energy = partial(incremental_potential.self_collision, config=config)
+        energy = partial(incremental_potential.self_collision, config=config, laws=laws)
         points = jnp.concatenate([x[:, None], x[step.self_contact.corners]], axis=1)
         convex.append(jax.vmap(jax.hessian(energy))(points, step.self_contact))
 
@@ -259,12 +261,12 @@ def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
     return jnp.einsum("h,hia,hjb->hiajb", stiffness, slope, slope)
 
 
-@partial(jax.jit, static_argnames="config")
-def _value_and_gradient(x, step, mesh, config):
+@partial(jax.jit, static_argnames=("config", "laws"))
+def _value_and_gradient(x, step, mesh, config, laws):
     """The potential, its gradient, and what rounding can do to the potential."""
 
     def potential(x):
-        elements = incremental_potential.elements(x, step, mesh, config)
+        elements = incremental_potential.elements(x, step, mesh, config, laws)
         return sum(jnp.sum(values) for values in elements.values()), elements
 
     (energy, elements), gradient = jax.value_and_grad(potential, has_aux=True)(x)

@@ -1,4 +1,4 @@
-"""Psi in use (22): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
+"""Psi in use (METHOD.md, Psi): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
 
 A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
 the range that they had in training, and a pose that is not finite, or no pose at all, is taken to be the last one:
@@ -200,7 +200,7 @@ def crowd(models: Sequence[Model]) -> Model:
     """
     if not models:
         raise ValueError("a crowd needs at least one model")
-    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=None)) for model in models)
+    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=models[0].wearer)) for model in models)
     for number, (leaves, structure) in enumerate(others, 1):
         same = structure == first[1] and all(a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0]))
         if not same:
@@ -223,8 +223,7 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
     Raises:
         ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
     """
-    run = trained.folder(str(run)) if str(run) in trained.shipped() else run
-    config, garment, predictor, normalizers = trained.psi(run)
+    config, garment, predictor, normalizers = trained.psi(trained.find(run))
     body = storage.load_body(config.body)
     return build(
         config,

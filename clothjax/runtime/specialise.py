@@ -1,4 +1,4 @@
-"""Psi made smaller and faster for one use (method section 6): exactly, or at the price of an error to be measured.
+"""Psi made smaller and faster for one use (METHOD.md, Psi): exactly, or at the price of an error to be measured.
 
 All of these take a model of `inference` and give another, which runs through the same functions.
 """

@@ -62,7 +62,7 @@ def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Ar
     weighted by the garment's cloth."""
     template = skinning.shaped_vertices(scene.garment, betas)
     measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
-    rest = energies.rest_measures(measured, scene.mesh, flat=config.flat_hinges)
+    rest = energies.rest_measures(measured, scene.mesh)
     areas = energies.vertex_areas(measured, scene.garment.faces)
     if scene.garment.cloth is not None:
         rest, areas = energies.regional(rest, areas, scene.mesh, jnp.asarray(scene.garment.cloth))

@@ -39,7 +39,7 @@ def time_step(
     elif scene.touchable:
         planes = contact_search.find_at_centroids(state.position, body, body_next, scene.body.faces)
     if planes is not None and "friction" not in physics.without:
-        near = incremental_potential.touching(state.position, planes, physics.friction_radius)
+        near = incremental_potential.touching(state.position, planes)
     if planes is not None and physics.edge_contact:
         at_edges = contact_search.find_at_edges(
             state.position, planes, scene.mesh, body, body_next, scene.patches, ahead

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.body.motion_clips import Clips
-from clothjax.config import Config, Ramp, Stage1Config
+from clothjax.config import Config, PhysicsTrainingConfig, Ramp, Stage1Config
 from clothjax.networks import normalisation
 from clothjax.networks.animators import Preconditioners
 from clothjax.networks.normalisation import Normalizers
@@ -21,8 +21,9 @@ DAMPING = 1e-3  # variances of normalised pose inputs; along half of their axes 
 
 def settings(config: Config) -> Config:
     """The configuration with that of the tuning in the place of stage 1's: for its bodies, at its last loss weights."""
-    names = [field.name for field in dataclasses.fields(Stage1Config)]
-    stage = Stage1Config(**{name: getattr(config.tuning, name) for name in names} | {"betas": config.stage1.betas})
+    names = [field.name for field in dataclasses.fields(PhysicsTrainingConfig)]
+    shared = {name: getattr(config.tuning, name) for name in names}
+    stage = Stage1Config(**shared, betas=config.stage1.betas, start_timestep=0.0)
     ramps = {field.name: getattr(config.loss, field.name) for field in dataclasses.fields(config.loss)}
     last = {
         name: Ramp(ramp.start if ramp.end is None else ramp.end)

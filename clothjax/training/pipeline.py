@@ -1,7 +1,13 @@
-"""A run from start to end: shapes, stage 1, stage 2, fine-tuning; resumes what was stopped."""
+"""A run from start to end: blend shapes, stage 1, stage 2, fine-tuning. It resumes what was stopped.
+
+A phase whose checkpoint is at its last step is read, not trained again; one that was under way goes on from its last
+checkpoint; all else starts anew. What lies before stage 1 (blend shapes, preconditioner) is in its first checkpoint.
+"""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +22,7 @@ from clothjax.networks.normalisation import Normalizers
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
 from clothjax.simulation import assembly
+from clothjax.simulation.assembly import Experiment
 from clothjax.training import (
     devices,
     fine_tuning,
@@ -30,170 +37,187 @@ from clothjax.training import (
 
 STEPS_PER_CALL = 20
 PHYSICS = ("stage1", "tuning")  # stages in which the physics is the loss
+# settings that a stage does not read, so a run may change them and go on
+MAY_DIFFER = {
+    "stage1": ("directory", "evaluation", "stage2", "tuning"),
+    "stage2": ("directory", "evaluation", "tuning"),
+    "tuning": ("directory", "evaluation"),
+    "baseline": ("directory", "evaluation"),
+}
+
+
+class Run(NamedTuple):
+    """What every phase of a training needs."""
+
+    experiment: Experiment
+    directory: Path
+    clips: Clips
+    device_mesh: Mesh | None
+
+    @property
+    def config(self) -> Config:
+        """The settings of the experiment."""
+        return self.experiment.config
+
+    def steps(self, stage: str) -> list[int]:
+        """Steps of a stage's checkpoints, in order."""
+        return checkpoint.steps(self.directory / stage / "checkpoints")
+
+
+class Psi(NamedTuple):
+    """What fine-tuning starts from: a predictor, its scales, and the decoder with blend shapes of its Phi."""
+
+    garment: dict
+    predictor: dict
+    normalizers: Normalizers
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
-    """Where a run is kept: as configured, or named after its configuration file."""
-    return Path(config.directory or Path("runs") / Path(argv[0]).stem)
+    """The folder of a run: as configured, or named after its configuration file, or without one after its garment."""
+    name = config.garment if argv[0].startswith("-") else argv[0]
+    return Path(config.directory or Path("runs") / Path(name).stem)
 
 
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
-    """Both stages and the tuning; returns the seconds each took, those of compilation, teacher and start apart."""
-    if device_mesh is not None:
-        progress.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
-    whole = assembly.assemble(config)
-    reel, bad = assembly.training_clips(whole)
-    for name in config.evaluation.motions:
-        assembly.evaluation_motion(whole, name)  # a wrong one shows now, not after hours
-    for name, count in bad.items():
-        if count:
-            progress.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
-    kept = configuration.to_dict(config)
-
+    """Train all stages of a run; return the seconds each took, with those of compilation, teacher and start apart."""
+    run = prepare(config, directory, device_mesh)
     if config.peer.network:
-        return _train_baseline(whole, reel, directory, device_mesh)
-
-    began = time.monotonic()
-    new = not checkpoint.steps(directory / "stage1" / "checkpoints")
-    shapes = _principal_shapes(whole, reel, device_mesh) if new and config.shapes.sequences > 0 else None
-    state = stage1.init(whole.scene, reel, config, shapes)
-    if new and config.model.latent_update == "descent" and config.model.descent_samples > 0:
-        model = {"params": state.params, "statistics": state.statistics}
-        with progress_bar("preconditioning", config.model.descent_samples) as report:
-            inverse = preconditioner.measure(model, whole.scene, reel, config, report, device_mesh)
-        state = stage1.preconditioned(state, inverse)
-    if new:
-        _spent(directory, start_seconds=time.monotonic() - began)
-
-    progress.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
-    first = loop.fit(
-        stage1.make_curriculum(whole.scene, reel, config, STEPS_PER_CALL, device_mesh),
-        devices.replicate(state, device_mesh),
-        steps=config.stage1.steps,
-        steps_per_call=STEPS_PER_CALL,
-        directory=directory / "stage1",
-        config=kept,
-        description=f"stage 1, {config.garment}",
-        may_differ=DIFFERENT_IN_STAGE1,
-    )
-    model = {"params": first.state.average, "statistics": first.state.statistics}
-    joints = input_joints(whole.names, config.stage2)
-
-    progress.say(
-        f"stage 2: the latent predictor, {config.stage2.steps} steps on {config.stage2.sequences} rollouts of Phi"
-    )
-    if checkpoint.steps(directory / "stage2" / "checkpoints")[-1:] == [config.stage2.steps]:
-        # were it not readable, training would go on from the one before, and stop at the first NaN
-        teacher, seconds = stage2.blank(model, whole.scene, reel, joints, config), 0.0
-    else:
-        if checkpoint.steps(directory / "tuning" / "checkpoints"):  # it must not be taken for this one's
-            raise ValueError(f"{directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
-        with progress_bar("rolling out the teacher", config.stage2.sequences) as report:
-            teacher, seconds = stage2.teach(model, whole.scene, reel, joints, config, report, device_mesh)
-    garment = jax.device_get(first.state.average["garment"])
-    begun = stage2.init(teacher, garment, config, stage2.ordinary_poses(whole.scene, reel, joints, config))
-    second = loop.fit(
-        stage2.make_update(teacher, config, STEPS_PER_CALL, device_mesh),
-        devices.replicate(begun, device_mesh),
-        steps=config.stage2.steps,
-        steps_per_call=STEPS_PER_CALL,
-        directory=directory / "stage2",
-        config=kept,
-        description=f"stage 2, {config.garment}",
-        may_differ=("directory", "evaluation", "tuning"),
-    )
-    clock = {
-        **_spent(directory, teacher_seconds=seconds),
+        return train_baseline(run)
+    first = train_phi(run)
+    second, clock = train_psi(run, first)
+    clock |= {
         "stage1_seconds": first.seconds,
         "stage2_seconds": second.seconds,
         "compile_seconds": first.compile_seconds + second.compile_seconds,
     }
     if config.tuning.steps > 0:
-        psi = second.state
-        third = fine_tune(
-            whole, reel, model["params"], psi.garment, psi.average, psi.normalizers, directory, device_mesh
-        )
+        psi = Psi(second.state.garment, second.state.average, second.state.normalizers)
+        third = fine_tune(run, first.state.average, psi)
         clock["compile_seconds"] += third.compile_seconds
         clock["tuning_seconds"] = third.seconds
     return clock
 
 
-def _principal_shapes(whole: assembly.Experiment, reel: Clips, device_mesh: Mesh | None) -> np.ndarray:
-    sequences = whole.config.shapes.sequences
-    progress.say(f"blend shapes: from {sequences} closed loops of cloth that the physics moves")
-    with progress_bar("simulating", sequences) as report:
-        return principal_shapes.principal(whole.scene, reel, whole.config, report, device_mesh)
+def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) -> Run:
+    """Load what a run needs, and check the motions that it will be measured on.
+
+    Raises:
+        ValueError: for a file that is missing or wrong, of training or of evaluation.
+    """
+    if device_mesh is not None:
+        progress.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
+    experiment = assembly.assemble(config)
+    clips, left_out = assembly.training_clips(experiment)
+    for name in config.evaluation.motions:
+        assembly.evaluation_motion(experiment, name)  # a wrong one shows now, not after hours
+    for name, count in left_out.items():
+        if count:
+            progress.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
+    return Run(experiment, directory, clips, device_mesh)
 
 
-def _train_baseline(
-    whole: assembly.Experiment, reel: Clips, directory: Path, device_mesh: Mesh | None
-) -> dict[str, float]:
-    """A peer's network, on the physics from its first step; where Phi would be, in `stage1/`."""
-    config, began = whole.config, time.monotonic()
-    new = not checkpoint.steps(directory / "stage1" / "checkpoints")
-    shapes = laplacian_shapes.laplacian(whole.scene, config)
-    if new and config.peer.network == "direct" and config.shapes.sequences > 0:
-        shapes = _principal_shapes(whole, reel, device_mesh)
+def train_phi(run: Run) -> loop.Fitted:
+    """Stage 1: blend shapes and preconditioner, then Phi on the physics."""
+    scene, config = run.experiment.scene, run.config
+    began, new = time.monotonic(), not run.steps("stage1")
+    state = stage1.init(scene, run.clips, config, _principal_shapes(run) if new else None)
+    if new and config.model.latent_update == "descent" and config.model.descent_samples > 0:
+        model = {"params": state.params, "statistics": state.statistics}
+        with progress_bar("preconditioning", config.model.descent_samples) as report:
+            inverse = preconditioner.measure(model, scene, run.clips, config, report, run.device_mesh)
+        state = stage1.preconditioned(state, inverse)
     if new:
-        _spent(directory, start_seconds=time.monotonic() - began)
-    kept = input_joints(whole.names, config.stage2)
-    progress.say(f"{config.peer.network} on the physics, {config.stage1.steps} steps")
-    fitted = loop.fit(
-        stage1.make_curriculum(
-            whole.scene, reel, config, STEPS_PER_CALL, device_mesh, animators.baseline_animator(kept)
-        ),
-        devices.replicate(stage1.init_peer(whole.scene, reel, kept, shapes, config), device_mesh),
-        steps=config.stage1.steps,
-        steps_per_call=STEPS_PER_CALL,
-        directory=directory / "stage1",
-        config=configuration.to_dict(config),
-        description=f"{config.peer.network}, {config.garment}",
-        may_differ=("directory", "evaluation"),
-    )
+        _add_seconds(run, start_seconds=time.monotonic() - began)
+    progress.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
+    update = stage1.make_curriculum(scene, run.clips, config, STEPS_PER_CALL, run.device_mesh)
+    return _fit(run, "stage1", update, state, config.stage1.steps, f"stage 1, {config.garment}")
+
+
+def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]]:
+    """Stage 2: rollouts of Phi, then Psi by regression on them; also return the seconds of the rollouts."""
+    scene, config = run.experiment.scene, run.config
+    stage, joints = config.stage2, input_joints(run.experiment.names, config.stage2)
+    model = {"params": phi.state.average, "statistics": phi.state.statistics}
+    progress.say(f"stage 2: the latent predictor, {stage.steps} steps on {stage.sequences} rollouts of Phi")
+    if run.steps("stage2")[-1:] == [stage.steps]:
+        # were it not readable, training would go on from the one before, and stop at the first NaN
+        teacher, seconds = stage2.blank(model, scene, run.clips, joints, config), 0.0
+    else:
+        if run.steps("tuning"):  # it must not be taken for this one's
+            raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
+        with progress_bar("rolling out the teacher", stage.sequences) as report:
+            teacher, seconds = stage2.teach(model, scene, run.clips, joints, config, report, run.device_mesh)
+    garment = jax.device_get(phi.state.average["garment"])
+    state = stage2.init(teacher, garment, config, stage2.ordinary_poses(scene, run.clips, joints, config))
+    update = stage2.make_update(teacher, config, STEPS_PER_CALL, run.device_mesh)
+    fitted = _fit(run, "stage2", update, state, stage.steps, f"stage 2, {config.garment}")
+    return fitted, _add_seconds(run, teacher_seconds=seconds)
+
+
+def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
+    """Train Psi further, on the gradients of the energies.
+
+    Args:
+        phi: parameters of Phi, whose preconditioner serves Psi too.
+    """
+    experiment, config = run.experiment, run.config
+    progress.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
+    joints = input_joints(experiment.names, config.stage2)
+    gradients = fine_tuning.preconditioners(experiment, run.clips, phi, psi.normalizers, joints)
+    animator = animators.psi_animator(psi.garment, psi.normalizers, joints, gradients)
+    settings = fine_tuning.settings(config)
+    update = stage1.make_curriculum(experiment.scene, run.clips, settings, STEPS_PER_CALL, run.device_mesh, animator)
+    state = fine_tuning.init(psi.predictor, experiment.scene, run.clips, config)
+    return _fit(run, "tuning", update, state, config.tuning.steps, f"tuning, {config.garment}")
+
+
+def train_baseline(run: Run) -> dict[str, float]:
+    """Train a baseline's network on the physics from its first step; it is kept where Phi would be, in `stage1/`."""
+    scene, config = run.experiment.scene, run.config
+    name, began, new = config.peer.network, time.monotonic(), not run.steps("stage1")
+    shapes = _principal_shapes(run) if new and name == "direct" else None
+    if shapes is None:
+        shapes = laplacian_shapes.laplacian(scene, config)
+    if new:
+        _add_seconds(run, start_seconds=time.monotonic() - began)
+    joints = input_joints(run.experiment.names, config.stage2)
+    progress.say(f"{name} on the physics, {config.stage1.steps} steps")
+    animator = animators.baseline_animator(joints)
+    update = stage1.make_curriculum(scene, run.clips, config, STEPS_PER_CALL, run.device_mesh, animator)
+    state = stage1.init_peer(scene, run.clips, joints, shapes, config)
+    fitted = _fit(run, "stage1", update, state, config.stage1.steps, f"{name}, {config.garment}", "baseline")
     return {"stage1_seconds": fitted.seconds, "compile_seconds": fitted.compile_seconds}
 
 
-def fine_tune(
-    whole: assembly.Experiment,
-    reel: Clips,
-    phi: dict,
-    garment: dict,
-    predictor: dict,
-    normalizers: Normalizers,
-    directory: Path,
-    device_mesh: Mesh | None = None,
+def _fit(
+    run: Run, stage: str, update: Callable, state: NamedTuple, steps: int, description: str, kind: str | None = None
 ) -> loop.Fitted:
-    """Psi after its regression, tuned on the gradients of the energies, with the preconditioner of its Phi.
-
-    Args:
-        phi: parameters; garment: its decoder and blend shapes.
-        directory: of the run.
-    """
-    config = whole.config
-    progress.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    kept = input_joints(whole.names, config.stage2)
-    psi = animators.psi_animator(
-        garment, normalizers, kept, fine_tuning.preconditioners(whole, reel, phi, normalizers, kept)
-    )
+    """Train a stage in its folder of the run; `kind` is its key in `MAY_DIFFER`, by default its name."""
     return loop.fit(
-        stage1.make_curriculum(whole.scene, reel, fine_tuning.settings(config), STEPS_PER_CALL, device_mesh, psi),
-        devices.replicate(fine_tuning.init(predictor, whole.scene, reel, config), device_mesh),
-        steps=config.tuning.steps,
+        update,
+        devices.replicate(state, run.device_mesh),
+        steps=steps,
         steps_per_call=STEPS_PER_CALL,
-        directory=directory / "tuning",
-        config=configuration.to_dict(config),
-        description=f"tuning, {config.garment}",
-        may_differ=("directory", "evaluation"),
+        directory=run.directory / stage,
+        config=configuration.to_dict(run.config),
+        description=description,
+        may_differ=MAY_DIFFER[kind or stage],
     )
 
 
-def _spent(directory: Path, **seconds: float) -> dict[str, float]:
-    """Keeps the time of what is not training, in the run's folder."""
+def _principal_shapes(run: Run) -> np.ndarray | None:
+    """Principal shapes [K, V, 3] m, or None where the configuration asks for smooth ones."""
+    sequences = run.config.shapes.sequences
+    if sequences == 0:
+        return None
+    progress.say(f"blend shapes: from {sequences} rollouts of cloth that the physics moves")
+    with progress_bar("simulating", sequences) as report:
+        return principal_shapes.principal(run.experiment.scene, run.clips, run.config, report, run.device_mesh)
+
+
+def _add_seconds(run: Run, **seconds: float) -> dict[str, float]:
+    """Add the time of what is not training to that in the run's folder; return the sums."""
     if jax.process_index() > 0:
         return seconds
-    directory.mkdir(parents=True, exist_ok=True)
-    return run_folder.add_seconds(directory, **seconds)
-
-
-# stage 1 does not read these, so a run may change them and go on
-DIFFERENT_IN_STAGE1 = ("directory", "evaluation", "stage2", "tuning")
+    run.directory.mkdir(parents=True, exist_ok=True)
+    return run_folder.add_seconds(run.directory, **seconds)

@@ -28,6 +28,8 @@ from clothjax.training.loss import weighing
 from clothjax.training.pool import Simulation, begin, dressed
 from clothjax.types import Array
 
+NORMALIZER_STEPS = 2000  # over which the feature statistics are collected; then they are frozen
+
 
 class TrainingState(NamedTuple):
     """All that stage 1 is at a step: resuming from it is exact."""
@@ -239,7 +241,7 @@ def make_update(
         statistics = state.statistics
         if seen is not None:
             statistics = jax.lax.cond(
-                metrics["nonfinite"] | (state.step >= config.model.normalizer_steps),
+                metrics["nonfinite"] | (state.step >= NORMALIZER_STEPS),
                 lambda statistics, _: statistics,
                 phi.observe,
                 statistics,

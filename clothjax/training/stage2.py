@@ -1,4 +1,4 @@
-"""Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (21)."""
+"""Stage 2: the latent predictor, trained by regression on the codes of a frozen Phi (METHOD.md, Training)."""
 
 import time
 from collections.abc import Callable
@@ -179,7 +179,7 @@ def rollout_loss(
 ) -> Array:
     """Mean squared error of one closed-loop rollout of the predictor `params`, as a share of the variance.
 
-    Z_t is perturbed, so that the predictor learns to come back: plain one-step regression diverges in closed loop.
+    The first Z is perturbed, so the predictor learns to come back: plain one-step regression diverges in closed loop.
 
     Args:
         state: for its normalizers, metric and decoder.
@@ -195,8 +195,6 @@ def rollout_loss(
 
     def body(latent, inputs):
         pose, target = inputs
-        if stage.pushforward:
-            latent = jax.lax.stop_gradient(latent)
         predicted = psi.predict(params, latent, pose, constants, stage.latent_decay)
         error = jnp.mean((predicted - target) ** 2)
         if stage.vertex_share > 0:
@@ -205,7 +203,7 @@ def rollout_loss(
         return predicted, error
 
     _, errors = jax.lax.scan(body, targets[0] + noise, (poses, targets[1:]))
-    return errors[-1] if stage.pushforward else jnp.mean(errors)
+    return jnp.mean(errors)
 
 
 def make_update(

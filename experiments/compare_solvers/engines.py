@@ -1,8 +1,6 @@
 """The two cloth solvers that are compared, ours and NVIDIA Newton's, as engines that advance one step; their scenes."""
 
-import contextlib
 from typing import NamedTuple
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ import numpy as np
 from clothjax.config import MaterialConfig, PhysicsConfig
 from clothjax.geometry import topology
 from clothjax.physics import energies, solver
-from clothjax.physics.incremental_potential import TimeStep
+from clothjax.physics.incremental_potential import LAWS, Laws, TimeStep
 from clothjax.types import Array, Contact, Material, Mesh, Rest
 
 SIZE = 0.6  # m, of the sheet
@@ -52,9 +50,10 @@ def scene(name: str, count: int = COUNT) -> Scene:
 
 
 class Reference:
-    """Our solver: Newton's method on `losses.potential`."""
+    """Our solver: Newton's method on `incremental_potential.potential`."""
 
-    def __init__(self, scene: Scene, timestep: float, disturbance: float = 0.0):
+    def __init__(self, scene: Scene, timestep: float, disturbance: float = 0.0, laws: Laws = LAWS):
+        self.laws = laws
         noise = np.random.default_rng(0).standard_normal(scene.start.shape)
         self.scene, self.timestep = scene, np.float64(timestep)
         self.rest, self.mass = at_rest(scene), masses(scene)
@@ -85,7 +84,9 @@ class Reference:
         """One step."""
         fall = np.array([0.0, -energies.GRAVITY * self.timestep**2, 0.0])
         start = np.where(self.scene.pinned[:, None], self.position, self.position + self.velocity + fall)
-        new, info = solver.solve_step(start, self.time_step(), self.scene.mesh, self.scene.pinned, CONFIG)
+        new, info = solver.solve_step(
+            start, self.time_step(), self.scene.mesh, self.scene.pinned, CONFIG, laws=self.laws
+        )
         self.position, self.velocity = new, new - self.position
         self.converged &= info.converged
 
@@ -161,20 +162,12 @@ def contact_stiffness(count: int) -> float:
 
 
 def quadratic(distance: Array, offset: float) -> Array:
-    """Newton's contact energy of signed distances [V] m, over our stiffness as in `losses.elements`: [V] m^3."""
+    """Newton's contact energy of signed distances [V] m, over our stiffness as in `elements`: [V] m^3."""
     depth = jnp.maximum(offset - distance, 0.0)
     return 0.5 * contact_stiffness(len(distance)) / CONFIG.collision_stiffness * depth * depth
 
 
-@contextlib.contextmanager
-def newtons_energies():
-    """Inside, our solver has Newton's membrane and contact in place of its own."""
-    try:
-        with mock.patch.multiple(energies, stretching=neo_hookean, collision=quadratic):
-            jax.clear_caches()
-            yield
-    finally:
-        jax.clear_caches()
+NEWTONS_LAWS = Laws(neo_hookean, quadratic)  # of its membrane and its contact
 
 
 def at_rest(scene: Scene) -> Rest:

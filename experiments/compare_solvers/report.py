@@ -18,7 +18,6 @@ length of an edge in our bending energy is the present one, Newton's that at res
 number of iterations (`--iterations` a frame, shared by its substeps), so that at long steps it has not converged.
 """
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -28,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from clothjax import cli
 from clothjax.physics import incremental_potential
 from clothjax.physics.energies import GRAVITY
 from clothjax.progress import progress_bar
@@ -36,12 +36,12 @@ from clothjax.render.ray_cast import SKIN, Surface
 from experiments.compare_solvers.engines import (
     CONFIG,
     COUNT,
+    NEWTONS_LAWS,
     SCENES,
     SPHERE,
     Reference,
     Scene,
     Vbd,
-    newtons_energies,
     scene,
 )
 
@@ -87,7 +87,7 @@ def energies(scene: Scene, position: np.ndarray) -> dict[str, float]:
 
 
 def pins(scene: Scene, position: np.ndarray) -> float:
-    """What membrane and bending at [V, 3] m pull at the pins, downwards, over the weight of the free vertices."""
+    """The downward pull of membrane and bending at [V, 3] m on the pins, over the weight of the free vertices."""
     step = Reference(scene, 1.0).time_step()
 
     def elastic(x):
@@ -119,21 +119,20 @@ def compare(
                 "pins": {"ours": pins(scenes[name], last["ours"])},
             }
             done += frames
-        with newtons_energies():
-            for name, n in jobs:
-                engines = {
-                    "same energies": Reference(scenes[name], 1.0 / (FPS * n)),
-                    "disturbed": Reference(scenes[name], 1.0 / (FPS * n), DISTURBANCE),
-                }
-                more, _ = simulate(engines, frames, n, lambda frame, done=done: report(done + frame))
-                track, done = tracks[name, n] | more, done + frames
-                measured[name, n]["converged"] &= all(engine.converged for engine in engines.values())
-                measured[name, n]["pins"]["newton"] = pins(scenes[name], track["newton"][-1])
-                measured[name, n]["distance"] = {
-                    "material": distances(track["ours"], track["newton"]),
-                    "solver": distances(track["same energies"], track["newton"]),
-                    "chance": distances(track["same energies"], track["disturbed"]),
-                }
+        for name, n in jobs:
+            engines = {
+                "same energies": Reference(scenes[name], 1.0 / (FPS * n), laws=NEWTONS_LAWS),
+                "disturbed": Reference(scenes[name], 1.0 / (FPS * n), DISTURBANCE, NEWTONS_LAWS),
+            }
+            more, _ = simulate(engines, frames, n, lambda frame, done=done: report(done + frame))
+            track, done = tracks[name, n] | more, done + frames
+            measured[name, n]["converged"] &= all(engine.converged for engine in engines.values())
+            measured[name, n]["pins"]["newton"] = pins(scenes[name], track["newton"][-1])
+            measured[name, n]["distance"] = {
+                "material": distances(track["ours"], track["newton"]),
+                "solver": distances(track["same energies"], track["newton"]),
+                "chance": distances(track["same energies"], track["disturbed"]),
+            }
     return {f"{name} 1/{FPS * n} s": result for (name, n), result in measured.items()}, tracks
 
 
@@ -181,7 +180,7 @@ def draw(out: Path, tracks: dict) -> None:
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = cli.Parser("experiments.compare_solvers", __doc__)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--substeps", nargs="+", type=int, default=[4], help=f"a frame; of `hang` always {AT_REST}")
     parser.add_argument("--frames", type=int, default=20, help=f"at {FPS} a second")

@@ -1,0 +1,234 @@
+"""Bodies of the SMPL family and motions of AMASS, written here in the layout that they are published in."""
+
+import pickle
+import sys
+import types
+
+import numpy as np
+import pytest
+import scipy.sparse
+import trimesh
+from samples import PARENTS, recording
+from scipy.spatial.transform import Rotation
+
+from clothjax.body import plausibility, skinning
+from clothjax.files import storage
+from clothjax.types import Pose
+from data_prep import amass, retarget, smpl
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A body of 24 joints with SMPL's arrays: an ellipsoid as high as a person."""
+    rng = np.random.default_rng(0)
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    vertices = np.asarray(mesh.vertices) * [0.5, 0.85, 0.2]
+    count = len(vertices)
+    regressor = np.zeros((24, count))
+    for row in regressor:
+        row[rng.choice(count, 5, replace=False)] = 0.2
+    weights = np.zeros((count, 24))
+    weights[np.arange(count)[:, None], rng.integers(0, 24, (count, 4))] = 1.0
+    table = np.array([PARENTS, range(24)])
+    table[0, 0] = 2**32 - 1
+    return {
+        "v_template": vertices,
+        "f": np.asarray(mesh.faces, np.uint32),
+        "weights": weights / weights.sum(axis=1, keepdims=True),
+        "shapedirs": 0.01 * rng.normal(size=(count, 3, 12)),
+        "posedirs": 0.01 * rng.normal(size=(count, 3, 207)),
+        "J_regressor": scipy.sparse.csc_matrix(regressor),
+        "kintree_table": table,
+        "bs_type": "lrotmin",
+    }
+
+
+class Ch:
+    """What chumpy's class is to pickle."""
+
+    def __init__(self, x):
+        self.x, self._dirty_vars = x, "x"
+
+
+@pytest.fixture
+def published(model, tmp_path, monkeypatch):
+    """The file as it is published: pickled, partly of chumpy, which is then not there to read it."""
+    module = types.ModuleType("chumpy.ch")
+    module.Ch = Ch
+    monkeypatch.setattr(Ch, "__module__", "chumpy.ch")
+    monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
+    monkeypatch.setitem(sys.modules, "chumpy.ch", module)
+    path = tmp_path / "SMPL_FEMALE.pkl"
+    path.write_bytes(pickle.dumps(model | {key: Ch(model[key]) for key in ("shapedirs", "v_template")}, protocol=2))
+    monkeypatch.setitem(sys.modules, "chumpy", None)
+    monkeypatch.setitem(sys.modules, "chumpy.ch", None)
+    return path
+
+
+def assert_is(body, model):
+    np.testing.assert_allclose(body.vertices, model["v_template"], atol=1e-6)
+    np.testing.assert_array_equal(body.faces, model["f"])
+    np.testing.assert_allclose(body.joints, model["J_regressor"] @ model["v_template"], atol=1e-6)
+    np.testing.assert_allclose(body.shapedirs, model["shapedirs"][..., :10], atol=1e-6)
+    np.testing.assert_allclose(body.posedirs, model["posedirs"], atol=1e-6)
+    np.testing.assert_allclose(body.weights, model["weights"], atol=1e-6)
+    assert tuple(body.parents) == PARENTS
+
+
+def test_a_pickled_body_becomes_a_body_file(published, model, tmp_path):
+    smpl.main(smpl.Arguments(published, tmp_path / "body.h5"))
+    body = storage.load_body(tmp_path / "body.h5")
+    assert_is(body, model)
+    names = storage.joint_names(tmp_path / "body.h5")
+    assert names[:3] == ("pelvis", "left_hip", "right_hip") and len(names) == 24
+    # joints of another shape are those that the regressor gives for its vertices
+    betas = np.linspace(-2, 2, 10).astype(np.float32)
+    regressed = model["J_regressor"] @ np.asarray(skinning.shaped_vertices(body, betas), np.float64)
+    np.testing.assert_allclose(skinning.shaped_joints(body, betas), regressed, atol=1e-5)
+
+
+def test_an_npz_is_read_like_a_pickle(model, tmp_path):
+    plain = model | {"J_regressor": model["J_regressor"].toarray()}
+    np.savez(tmp_path / "SMPL_NEUTRAL.npz", **plain)
+    body, _ = smpl.body(tmp_path / "SMPL_NEUTRAL.npz")
+    assert_is(body, model)
+    assert smpl.body(tmp_path / "SMPL_NEUTRAL.npz", shapes=12)[0].shapedirs.shape[-1] == 12
+    with pytest.raises(ValueError, match=r"has 12 shape parameters; --shapes 13"):
+        smpl.body(tmp_path / "SMPL_NEUTRAL.npz", shapes=13)
+    assert len(smpl.NAMES[52]) == 52 and len(smpl.NAMES[55]) == 55
+
+
+class Evil:
+    def __init__(self, call, *arguments):
+        self.reduced = (call, arguments)
+
+    def __reduce__(self):
+        return self.reduced
+
+
+@pytest.mark.parametrize("call", [exec, eval, __import__, getattr, open])
+def test_a_hostile_pickle_is_refused_and_not_run(call, model, tmp_path):
+    path, trap = tmp_path / "evil.pkl", tmp_path / "trap"
+    path.write_bytes(pickle.dumps(model | {"v_template": Evil(call, f"open({str(trap)!r}, 'w')")}))
+    with pytest.raises(ValueError, match=r"evil\.pkl: not a body model .* do not trust it"):
+        smpl.body(path)
+    assert not trap.exists()
+
+
+def test_a_pickle_that_wants_all_memory_is_refused(model, tmp_path):
+    path = tmp_path / "huge.pkl"
+    path.write_bytes(pickle.dumps(model | {"v_template": Evil(np.ndarray, (2**58,))}))
+    with pytest.raises(ValueError, match=r"huge\.pkl"):
+        smpl.body(path)
+
+
+def test_a_sparse_array_that_reaches_out_of_itself_is_refused(model, tmp_path):
+    path = tmp_path / "far.pkl"
+    regressor = model["J_regressor"].copy()
+    regressor.indices = regressor.indices + 2**24
+    path.write_bytes(pickle.dumps(model | {"J_regressor": regressor}))
+    with pytest.raises(ValueError, match=r"far\.pkl: .*ind"):
+        smpl.body(path)
+
+
+def test_a_truncated_file_is_refused_wherever_it_ends(published):
+    whole = published.read_bytes()
+    for end in np.linspace(0, len(whole) - 1, 40).astype(int):
+        published.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match=r"SMPL_FEMALE\.pkl"):
+            smpl.body(published)
+
+
+@pytest.mark.parametrize(
+    "key, value, said",
+    [
+        ("weights", np.ones((642, 7)) / 7, "has 7 joints"),
+        ("weights", None, "has no weights"),
+        ("v_template", np.ones((642, 2)), r"v_template has shape \(642, 2\)"),
+        ("v_template", np.full((642, 3), np.nan), "v_template has an entry that is not finite"),
+        ("f", np.full((5, 3), 642), "a face names vertex 642 of 642"),
+        ("f", np.zeros((0, 3)), "f is empty"),
+        ("kintree_table", np.array([range(24), range(24)]), "a parent does not come before its child"),
+        ("J_regressor", np.ones((23, 642)), "J_regressor has shape"),
+        ("shapedirs", np.array("x"), "shapedirs is not of numbers"),
+    ],
+)
+def test_what_is_wrong_with_a_body_is_said(key, value, said, model, tmp_path):
+    wrong = model | {"J_regressor": model["J_regressor"].toarray(), key: value}
+    np.savez(tmp_path / "model.npz", **{k: v for k, v in wrong.items() if v is not None})
+    with pytest.raises(ValueError, match=rf"model\.npz: .*{said}"):
+        smpl.body(tmp_path / "model.npz")
+
+
+# Motion
+
+
+def test_a_recording_moves_an_smpl_body_as_it_is(model, tmp_path):
+    np.savez(tmp_path / "model.npz", **(model | {"J_regressor": model["J_regressor"].toarray()}))
+    smpl.main(smpl.Arguments(tmp_path / "model.npz", tmp_path / "body.h5"))
+    data = recording()
+    np.savez(tmp_path / "clip.npz", **data)
+    amass.main(amass.Arguments(tmp_path / "clip.npz", tmp_path / "out.h5", body=str(tmp_path / "body.h5")))
+    motion = storage.load_motion(tmp_path / "out.h5", storage.joint_names(tmp_path / "body.h5"))
+    assert motion.fps == 30 and len(motion.translation) == 31
+    poses = data["poses"].reshape(121, 52, 3)[::4]
+    for joint in (1, 2, 16, 17):
+        found = Rotation.from_matrix(motion.rotations[:, joint]).as_rotvec()
+        np.testing.assert_allclose(found, poses[:, joint], atol=1e-5)
+    # up in z becomes up in y, and ahead in y becomes ahead in -z
+    np.testing.assert_allclose(motion.rotations[:, 0], np.broadcast_to(np.eye(3), (31, 3, 3)), atol=1e-5)
+    path = motion.translation - motion.translation[0]
+    assert path[-1, 2] < -0.5 and abs(path[-1, 0]) < 1e-6 and np.ptp(path[:, 1]) < 0.1
+
+
+def test_a_recording_moves_the_embedded_body_possibly(tmp_path):
+    np.savez(tmp_path / "clip.npz", **recording())
+    motion, (body, names) = amass.retarget_amass(amass.read_amass(tmp_path / "clip.npz"), "body")
+    assert names == storage.joint_names("body")
+    assert plausibility.bad_frames(motion, body).size == 0
+    places = plausibility.joint_positions(motion, body)
+    head, foot, hand, shoulder = (
+        places[:, retarget.cmu_names(names).index(joint)] for joint in ("Head", "LeftFoot", "LeftHand", "LeftArm")
+    )
+    assert (head[:, 1] - foot[:, 1] > 1.2).all()
+    # the arm of a T-pose, lowered by 1.2 rad
+    arm = (hand - shoulder) / np.linalg.norm(hand - shoulder, axis=-1, keepdims=True)
+    np.testing.assert_allclose(arm, np.broadcast_to([np.cos(1.2), -np.sin(1.2), 0], arm.shape), atol=0.2)
+    poses = [Pose(*frame) for frame in zip(motion.rotations, np.float32(motion.translation))]
+    lowest = [float(skinning.pose_body(body, body.vertices, body.joints, pose)[:, 1].min()) for pose in poses[::5]]
+    assert -0.03 < min(lowest) < 0.03
+
+
+def test_a_recording_that_is_up_in_y_can_be_told(tmp_path):
+    data = recording(joints=55)
+    data["mocap_frame_rate"] = data.pop("mocap_framerate")  # as of SMPL-X
+    turn = Rotation.from_euler("x", -90, degrees=True)
+    first = Rotation.from_rotvec(data["poses"][:, :3])
+    data["poses"][:, :3] = (turn * first).as_rotvec()
+    np.savez(tmp_path / "y.npz", **(data | {"trans": data["trans"] @ turn.as_matrix().T}))
+    np.savez(tmp_path / "z.npz", **recording())
+    one, other = amass.read_amass(tmp_path / "y.npz", up="y"), amass.read_amass(tmp_path / "z.npz")
+    np.testing.assert_allclose(one.rotations, other.rotations, atol=1e-6)
+    np.testing.assert_allclose(one.translation, other.translation, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"poses": None}, "no poses in it"),
+        ({"mocap_framerate": None}, "no mocap_framerate in it"),
+        ({"poses": np.zeros((121, 30))}, r"poses \(121, 30\) and trans \(121, 3\)"),
+        ({"trans": np.zeros((120, 3))}, r"trans \(120, 3\)"),
+        ({"mocap_framerate": np.array(0.0)}, "not a rate in Hz"),
+        (
+            {"trans": np.where(np.arange(121)[:, None] == 7, np.nan, np.zeros((121, 3)))},
+            "trans of frame 7 is not finite",
+        ),
+        ({"poses": np.array([{}], object)}, "not a motion of AMASS"),
+    ],
+)
+def test_what_is_wrong_with_a_recording_is_said(change, said, tmp_path):
+    data = recording() | change
+    np.savez(tmp_path / "clip.npz", **{k: v for k, v in data.items() if v is not None})
+    with pytest.raises(ValueError, match=rf"clip\.npz: .*{said}"):
+        amass.read_amass(tmp_path / "clip.npz")

@@ -1,0 +1,283 @@
+"""What other runtimes make of a model is what jax makes of it."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from samples import apart, random_model
+from toy import small
+
+from clothjax.body import skinning
+from clothjax.commands import convert
+from clothjax.export import litert, native, onnx, safetensors, stablehlo
+from clothjax.export.onnx_graph import session
+from clothjax.runtime import inference, specialise
+from clothjax.types import Pose
+
+
+def test_onnx_is_the_model_in_closed_loop(model, motion, tmp_path):
+    path = onnx.to_onnx(model, tmp_path / "g.onnx")
+    assert apart(onnx.run_onnx(path, model, motion), model, motion).max() < 2e-5
+    small_model = specialise.specialise(model, blendshapes=100)
+    path = onnx.to_onnx(small_model, tmp_path / "s.onnx")
+    found = onnx.run_onnx(path, small_model, motion)
+    assert apart(found, small_model, motion).max() < 2e-5 and apart(found, model, motion).max() > 1e-3
+
+
+def test_onnx_of_a_folded_code_and_of_a_relu(motion, tmp_path):
+    model = random_model(skip=False)
+    for name, each in (("plain", model), ("folded", specialise.specialise(model)),
+                       ("fewer", specialise.specialise(model, blendshapes=5))):  # fmt: skip
+        path = onnx.to_onnx(each, tmp_path / f"{name}.onnx")
+        assert apart(onnx.run_onnx(path, each, motion), each, motion).max() < 1e-5
+    assert model.config.model.blendshape_relu and small().model.decoder_skip
+
+
+def test_onnx_of_a_model_that_sees_the_root_alone(motion, tmp_path):
+    others = ("joint", "leg", "foot", "back", "spine", "shoulder", "arm", "neck", "head")
+    model = random_model(True, others)
+    assert [model.names[i] for i in model.kept] == ["Hips"]
+    path = onnx.to_onnx(model, tmp_path / "g.onnx")
+    assert apart(onnx.run_onnx(path, model, motion), model, motion).max() < 2e-5
+
+
+def test_onnx_takes_wild_input_as_the_model_does(model, motion, tmp_path):
+    run = session(onnx.to_onnx(model, tmp_path / "g.onnx"))
+    rotations, translation = np.array(motion.rotations[:12]), np.array(motion.translation[:12])
+    rotations[4, 3, 1, 1] = np.nan
+    translation[7] = np.inf
+    rotations[9] = 0.0  # no rotation at all, but finite
+    state = inference.initial_state(model, Pose(rotations[0], translation[0]))
+    tensors = onnx.first_state(model, Pose(rotations[0], translation[0]))
+    told = []
+    for turn, place in zip(rotations, translation):
+        state, vertices = inference.step(model, state, Pose(jnp.asarray(turn), jnp.asarray(place)))
+        feed = dict(zip(onnx.INPUTS, (*tensors, turn[None], place[None])))
+        *tensors, ok, shown = run.run([*onnx.FOLLOWING, "vertices"], feed)
+        np.testing.assert_allclose(shown[0], vertices, atol=1e-4)
+        assert ok.shape == (1,) and bool(ok[0]) == bool(state.ok)
+        told.append(bool(ok[0]))
+    assert not told[4] and not told[7] and not told[9] and any(told)
+
+
+def test_onnx_holds_codes_to_their_range_and_says_so(model, motion, tmp_path):
+    pose = Pose(np.asarray(motion.rotations[5], np.float32), motion.translation[5])
+    feed = dict(zip(onnx.INPUTS, (*onnx.first_state(model, pose), pose.rotations[None], pose.translation[None])))
+    bounds = model.network.code_bounds
+    narrow = bounds._replace(low=0 * bounds.low - 0.2, high=0 * bounds.high + 0.2, slack=0 * bounds.slack + 1e-3)
+    strict = dataclasses.replace(model, network=model.network._replace(code_bounds=narrow))
+    stranger = dataclasses.replace(model, wearer=model.wearer._replace(known=jnp.asarray(False)))
+    for name, each, fine in (("usual", model, True), ("strict", strict, False), ("stranger", stranger, False)):
+        run = session(onnx.to_onnx(each, tmp_path / f"{name}.onnx"))
+        latent, ok = run.run(["next_latent", "ok"], feed)
+        expected, _ = inference.step(each, inference.initial_state(each, pose), pose)
+        np.testing.assert_allclose(latent[0], expected.latent, atol=1e-4)
+        assert bool(ok[0]) == bool(expected.ok) == fine
+    assert np.abs(session(tmp_path / "strict.onnx").run(["next_latent"], feed)[0]).max() <= 0.2 + 1e-6
+
+
+def test_int8_is_small_and_near(model, motion, tmp_path):
+    whole = onnx.to_onnx(model, tmp_path / "f.onnx")
+    eight = onnx.to_onnx(model, tmp_path / "e.onnx", int8=True)
+    assert eight.stat().st_size < 0.3 * whole.stat().st_size
+    error = apart(onnx.run_onnx(eight, model, motion), model, motion)
+    assert error.max() < 2e-3 and error.mean() < 4e-4
+    assert error.mean() > 1e-6
+
+
+@pytest.mark.parametrize("batch", [3, None])
+def test_onnx_of_many_characters(batch, model, motion, tmp_path):
+    run = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=batch))
+    pose = Pose(np.asarray(motion.rotations[20:23], np.float32), motion.translation[20:23])
+    states = [onnx.first_state(model, Pose(pose.rotations[i], pose.translation[i])) for i in range(3)]
+    together = [np.concatenate(parts) for parts in zip(*states)]
+    *_, vertices = run.run([*onnx.FOLLOWING, "vertices"], dict(zip(onnx.INPUTS, (*together, *pose))))
+    for i in range(3):
+        alone = Pose(jnp.asarray(pose.rotations[i]), jnp.asarray(pose.translation[i]))
+        expected = inference.step(model, inference.initial_state(model, alone), alone)[1]
+        np.testing.assert_allclose(vertices[i], expected, atol=2e-5)
+
+
+def test_an_engine_can_skin_the_garment_and_need_not_see_it(model, motion, tmp_path):
+    pose = Pose(np.asarray(motion.rotations[5], np.float32), motion.translation[5])
+    feed = dict(zip(onnx.INPUTS, (*onnx.first_state(model, pose), pose.rotations[None], pose.translation[None])))
+    shown = session(onnx.to_onnx(model, tmp_path / "w.onnx")).run(None, feed)
+    canonical = onnx.to_onnx(specialise.specialise(model), tmp_path / "c.onnx", output="canonical")
+    *state, vertices = session(canonical).run(None, feed)
+    told = json.loads(canonical.with_suffix(".json").read_text())
+    transforms = skinning.joint_transforms(
+        jnp.asarray(pose.rotations), jnp.asarray(told["joint_positions"]), np.array(told["parents"])
+    )
+    blended = skinning.blend(jnp.asarray(told["skin_weights"]), transforms[np.array(told["skin_joints"])])
+    placed = skinning.apply(blended, jnp.asarray(vertices[0])) + pose.translation[None]
+    np.testing.assert_allclose(placed, shown[-1][0], atol=1e-4)
+    unseen = session(onnx.to_onnx(model, tmp_path / "n.onnx", output="none")).run(None, feed)
+    assert len(unseen) == len(shown) - 1
+    for one, other, same in zip(shown, unseen, state):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+        np.testing.assert_allclose(one, same, atol=1e-5)
+
+
+def test_the_first_state_as_the_json_says(model, motion, tmp_path):
+    path = onnx.to_onnx(model, tmp_path / "g.onnx")
+    told = json.loads(path.with_suffix(".json").read_text())
+    assert told["joints"][0] and len(told["joints"]) == len(told["parents"]) and told["fps"] == 30.0
+    run = session(path)
+    turn, place = np.asarray(motion.rotations[:1], np.float32), motion.translation[:1]
+    latent = np.asarray(told["first_latent"], np.float32)[None]
+    anything = np.ones(told["shapes"]["history"], np.float32)
+    (found,) = run.run(["next_history"], dict(zip(onnx.INPUTS, (latent, anything, turn, place))))
+    state = [latent, np.repeat(found[:, :1], 2, axis=1)]
+    for mine, theirs in zip(state, onnx.first_state(model, Pose(turn[0], place[0]))):
+        np.testing.assert_allclose(mine, theirs, atol=1e-6)
+
+
+OLD = """
+import sys
+import numpy as np
+import onnxruntime
+
+given = np.load(sys.argv[2])
+run = onnxruntime.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
+state, vertices = [given["latent"], given["history"]], []
+for rotations, translation in zip(given["rotations"][:, None], given["translation"][:, None]):
+    names = ("latent", "history", "rotations", "translation")
+    *state, ok, shown = run.run(None, dict(zip(names, (*state, rotations, translation))))
+    vertices.append(shown[0])
+np.save(sys.argv[3], np.stack(vertices))
+print(onnxruntime.__version__)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.version_info >= (3, 12), reason="ONNX Runtime 1.15 is for Python 3.11 at the most")
+@pytest.mark.parametrize("int8", [False, True])
+def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
+    venv.create(tmp_path / "old", with_pip=True)
+    python = tmp_path / "old" / "bin" / "python"
+    subprocess.run([python, "-m", "pip", "install", "-q", "onnxruntime==1.15.1", "numpy<2"], check=True)
+    motion = convert.validation(model)
+    latent, history = onnx.first_state(model, Pose(motion.rotations[0], motion.translation[0]))
+    given, found = tmp_path / "given.npz", tmp_path / "found.npy"
+    rotations, translation = (np.asarray(x, np.float32) for x in motion[:2])
+    np.savez(given, latent=latent, history=history, rotations=rotations, translation=translation)
+    path = onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
+    done = subprocess.run([python, "-c", OLD, path, given, found], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "1.15.1" and len(np.load(found)) == 300
+    assert apart(np.load(found), model, motion).max() < (2e-3 if int8 else 1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npm") is None, reason="needs Node")
+def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
+    subprocess.run(["npm", "install", "--silent", "onnxruntime-web"], check=True, cwd=tmp_path)
+    for name in ("psi.mjs", "garment.mjs"):
+        shutil.copy(Path(convert.__file__).parent / "deploy" / name, tmp_path)
+    motion = convert.validation(model)
+    rotations = np.asarray(motion.rotations).reshape(len(motion.rotations), -1)
+    given = {"rotations": rotations.tolist(), "translation": motion.translation.tolist()}
+    (tmp_path / "motion.json").write_text(json.dumps(given))
+    for int8, most in ((False, 1e-4), (True, 2e-3)):
+        onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
+        command = ["node", "psi.mjs", "g.onnx", "motion.json", "vertices.bin"]
+        done = subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, text=True)
+        assert "ms a frame, one thread of WebAssembly" in done.stdout
+        found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(300, -1, 3)
+        assert apart(found, model, motion).max() < most
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    native.compiler() is None or shutil.which("go") is None,
+    reason="needs a C compiler, and Go to fetch ONNX Runtime's header",
+)
+def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
+    import onnxruntime
+
+    module = "github.com/yalue/onnxruntime_go@v1.27.0"  # brings the header; the library is that of the Python package
+    got = subprocess.run(["go", "mod", "download", "-json", module], check=True, capture_output=True, text=True)
+    (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
+    (tmp_path / "libonnxruntime.so.1").symlink_to(library)
+    source = Path(convert.__file__).parent / "deploy" / "play_onnx.c"
+    command = [native.compiler(), "-std=c99", "-O2", "-Wall", "-Werror", "-isystem", json.loads(got.stdout)["Dir"]]
+    program = tmp_path / "play_onnx"
+    command += [source, tmp_path / "libonnxruntime.so.1", f"-Wl,-rpath,{tmp_path}", "-o", program]
+    subprocess.run(command, check=True)
+    motion = convert.validation(model)
+    rows = [np.asarray(x, np.float32).reshape(300, -1) for x in (motion.rotations, motion.translation)]
+    np.concatenate(rows, axis=1).tofile(tmp_path / "motion.bin")
+    for int8, most in ((False, 1e-4), (True, 2e-3)):
+        onnx.to_onnx(model, tmp_path / "g.onnx", int8=int8)
+        command = [program, tmp_path / "g.onnx", tmp_path / "motion.bin", tmp_path / "vertices.bin"]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        assert done.stdout.endswith("us a frame, one thread\n")
+        found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(300, -1, 3)
+        assert apart(found, model, motion).max() < most
+    (tmp_path / "g.json").unlink()
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and "g.json: cannot be opened" in done.stderr
+
+
+@pytest.mark.slow
+def test_litert_agrees_over_300_frames(model, tmp_path):
+    """In an environment of its own, as its module says: TensorFlow wants older packages."""
+    venv.create(tmp_path / "tf", with_pip=True)
+    python = tmp_path / "tf" / "bin" / "python"
+    root = Path(convert.__file__).parents[2]
+    packages = (f"{root}[export]", "tensorflow-cpu", "ai-edge-litert")
+    subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
+    for int8, most in (((), 0.1), (("--int8",), 2.0)):
+        out = tmp_path / "t.tflite"
+        command = [python, "-m", "clothjax", "convert", "tshirt", "--to", "litert", "--out", out, *int8]
+        subprocess.run(command, check=True, cwd=root)
+        told = json.loads(out.with_suffix(".json").read_text())
+        assert told["distance_to_jax"]["frames"] == 300 and 0 < told["distance_to_jax"]["max_mm"] < most
+        assert told["results"][-1] == "vertices" and told["arguments"]["translation"] == [3]
+
+
+def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
+    path = stablehlo.to_stablehlo(model, tmp_path / "g.stablehlo")
+    assert apart(stablehlo.run_stablehlo(path, model, motion), model, motion).max() < 2e-5
+
+
+def test_safetensors_hold_the_whole_model(model, motion, tmp_path):
+    for each in (model, specialise.specialise(model, blendshapes=50)):
+        path = safetensors.to_safetensors(each, tmp_path / "g.safetensors")
+        again = safetensors.from_safetensors(path)
+        np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(each, motion)[0])
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"g\.safetensors: not a whole model in safetensors .*convert it again"):
+        safetensors.from_safetensors(path)
+
+
+def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(convert, "FRAMES", 40)
+    out = tmp_path / "s.onnx"
+    convert.main(["skirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
+    told = json.loads(out.with_suffix(".json").read_text())
+    assert told["betas"] == [1.0] and 0 < told["distance_to_jax"]["mean_mm"] < 1
+    assert "over 40 frames of autoregressive rollout" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="is of onnx and litert, not of stablehlo"):
+        convert.main(["skirt", "--to", "stablehlo", "--int8"])
+    with pytest.raises(ValueError, match="is of onnx, not of c"):
+        convert.main(["skirt", "--to", "c", "--batch", "3"])
+
+
+def test_what_is_not_installed_is_said(model, monkeypatch, tmp_path):
+    for package, write, ending in (
+        ("onnx", onnx.to_onnx, "onnx"),
+        ("safetensors", safetensors.to_safetensors, "safetensors"),
+    ):
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(ImportError, match=r"pip install clothjax\[export\]"):
+            write(model, tmp_path / f"g.{ending}")
+    monkeypatch.setitem(sys.modules, "tensorflow", None)
+    with pytest.raises(ImportError, match="pip install tensorflow-cpu ai-edge-litert"):
+        litert.to_litert(model, tmp_path / "g.tflite")

@@ -1,0 +1,237 @@
+"""Psi in plain C is Psi, whatever its input, and no file harms it."""
+
+import dataclasses
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from samples import apart, random_model
+
+import clothjax as cj
+from clothjax.commands import convert
+from clothjax.export import native, onnx, psi_ffi
+from clothjax.runtime import inference, specialise
+from clothjax.types import Pose
+
+pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
+PLAY = Path(convert.__file__).parent / "deploy" / "play.c"
+SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return native.build(tmp_path_factory.mktemp("psi"), (*native.FLAGS, "-Wall", "-Wextra", "-Werror"))
+
+
+def rounded(model):
+    """The model with the matrices that a .psi has."""
+    network = model.network
+
+    def eight(kernel, even=False):
+        matrix, gain, scale = native.eight_bits(kernel, even)
+        return jnp.asarray((scale[:, None] * matrix * gain).T)
+
+    def layer(it, even=False):
+        return it if it is None or it.kernel is None else it._replace(kernel=eight(it.kernel, even))
+
+    return dataclasses.replace(
+        model,
+        network=network._replace(
+            pose=eight(network.pose, True),
+            code=layer(network.code),
+            hidden=tuple(map(layer, network.hidden)),
+            read=layer(network.read, True),
+            decoder=tuple(map(layer, network.decoder)),
+            mix=layer(network.mix),
+            shapes=eight(network.shapes, True),
+        ),
+    )
+
+
+def test_c_is_the_model_of_eight_bits_in_closed_loop(library, model, motion, tmp_path):
+    """And nearer to the model than ONNX Runtime in eight bits."""
+    few = specialise.specialise(model, blendshapes=100, max_influences=3)
+    for each in (model, specialise.specialise(model), few):
+        found = native.run_c(library, native.to_c(each, tmp_path / "g.psi"), motion)
+        assert apart(found, rounded(each), motion).max() < 3e-5
+        error = apart(found, each, motion)
+        peer = apart(onnx.run_onnx(onnx.to_onnx(each, tmp_path / "g.onnx", int8=True), each, motion), each, motion)
+        assert 1e-6 < error.mean() < peer.mean() and error.max() < peer.max()
+
+
+def test_c_of_a_folded_code_and_of_a_relu(library, motion, tmp_path):
+    plain = random_model(skip=False)
+    for each in (plain, specialise.specialise(plain), specialise.specialise(plain, blendshapes=5)):
+        found = native.run_c(library, native.to_c(each, tmp_path / "g.psi"), motion)
+        assert apart(found, rounded(each), motion).max() < 1e-4
+    assert each.network.code.kernel is None and each.network.mix is not None
+
+
+def test_c_takes_wild_input_as_the_model_does(library, model, motion, tmp_path):
+    rotations, translation = np.array(motion.rotations[:14], np.float32), np.array(motion.translation[:14])
+    rotations[4, 3, 1, 1] = np.nan
+    translation[7] = np.inf
+    rotations[9] = 0.0  # no rotation at all, but finite
+    translation[11] = 1e20
+    stranger = dataclasses.replace(model, wearer=model.wearer._replace(known=jnp.asarray(False)))
+    for each, first in ((model, 0), (stranger, 0), (model, 4), (model, 7)):
+        path = native.to_c(each, tmp_path / "g.psi")
+        psi = native.Psi(library, path, rotations[first], translation[first])
+        exact = rounded(each)
+        state = inference.initial_state(exact, Pose(rotations[first], translation[first]))
+        told = []
+        for turn, place in zip(rotations[first:], translation[first:]):
+            state, vertices = inference.step(exact, state, Pose(jnp.asarray(turn), jnp.asarray(place)))
+            assert psi.step(turn, place) == bool(state.ok)
+            np.testing.assert_allclose(psi.vertices, vertices, atol=2e-4)
+            told.append(bool(state.ok))
+        assert any(told) == (each is model)
+    with pytest.raises(ValueError, match=r"poses are \[31, 3, 3\] and \[3\], not \(5, 3, 3\)"):
+        psi.step(rotations[0, :5], translation[0])
+
+
+def test_a_garment_that_nobody_sees_goes_on(library, model, motion, tmp_path):
+    path = native.to_c(model, tmp_path / "g.psi")
+    seen, unseen = (native.Psi(library, path, motion.rotations[0], motion.translation[0]) for _ in range(2))
+    for t in range(20):
+        seen.step(motion.rotations[t], motion.translation[t])
+        unseen.step(motion.rotations[t], motion.translation[t], vertices=t == 19)
+    np.testing.assert_array_equal(seen.vertices, unseen.vertices)
+
+
+@pytest.fixture(scope="module")
+def packed(model):
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    return psi_ffi.pack(model)
+
+
+def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
+    """Bit for bit, in a scan, through frames of NaN, also while nobody sees the garment."""
+    rotations, translation = np.array(motion.rotations[:30], np.float32), np.array(motion.translation[:30], np.float32)
+    rotations[11, 2] = np.nan
+    poses = Pose(jnp.asarray(rotations), jnp.asarray(translation))
+    first = inference.initial_state(model, jax.tree.map(lambda x: x[0], poses))
+
+    def frame(state, pose):
+        unseen, nothing = psi_ffi.step(packed, state, pose, vertices=False)
+        state, vertices = psi_ffi.step(packed, state, pose)
+        assert nothing is None
+        same = jax.tree.map(lambda a, b: jnp.all((a == b) | jnp.isnan(a)), unseen, state)
+        return state, (vertices, state.ok, jnp.stack(jax.tree.leaves(same)))
+
+    _, (vertices, ok, same) = jax.jit(lambda s, p: jax.lax.scan(frame, s, p))(first, poses)
+    psi = native.Psi(library, native.to_c(model, tmp_path / "g.psi"), rotations[0], translation[0])
+    for t in range(30):
+        assert psi.step(rotations[t], translation[t]) == bool(ok[t])
+        np.testing.assert_array_equal(vertices[t], psi.vertices)
+    assert np.asarray(same).all() and not ok[11] and ok[:11].all()
+
+
+def test_c_inside_of_jax_for_several_at_once(packed, model, motion):
+    poses = Pose(*(jnp.asarray(x[[0, 20, 40]], jnp.float32) for x in motion[:2]))
+    states = jax.vmap(lambda pose: inference.initial_state(model, pose))(poses)
+    _, together = jax.vmap(lambda s, p: psi_ffi.step(packed, s, p))(states, poses)
+    for i in range(3):
+        _, alone = psi_ffi.step(packed, *jax.tree.map(lambda x, i=i: x[i], (states, poses)))
+        np.testing.assert_array_equal(together[i], alone)
+
+
+def test_c_inside_of_jax_refuses_what_is_not_its_own(packed, model, motion):
+    pose = Pose(*(jnp.asarray(x[0], jnp.float32) for x in motion[:2]))
+    state = inference.initial_state(model, pose)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the state or the pose is of another garment"):
+        psi_ffi.step(packed, state._replace(latent=state.latent[1:]), pose)[1].block_until_ready()
+    damaged = dataclasses.replace(packed, file=packed.file[:-64])
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"a damaged \.psi"):
+        psi_ffi.step(damaged, state, pose)[1].block_until_ready()
+
+
+def made(folder, *flags):
+    """The example program."""
+    program = folder / "play"
+    sources = (PLAY, native.SOURCES[1])
+    command = [native.compiler(), *flags, f"-I{native.SOURCES[0].parent}", *sources, "-lm", "-o", program]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode and "-fsanitize=address,undefined" in flags:
+        pytest.skip(f"no sanitizers here: {done.stderr[:200]}")
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def frames(motion, path, count):
+    rows = [np.asarray(x[:count], np.float32).reshape(count, -1) for x in (motion.rotations, motion.translation)]
+    np.concatenate(rows, axis=1).tofile(path)
+    return path
+
+
+def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(convert, "FRAMES", 20)
+    out = tmp_path / "engine" / "skirt.psi"
+    convert.main(["skirt", "--to", "c", "--out", str(out)])
+    assert "over 20 frames of autoregressive rollout" in capsys.readouterr().out
+    shutil.copy(PLAY, out.parent)
+    program = out.parent / "play"
+    command = [
+        native.compiler(),
+        "-std=c99",
+        "-pedantic-errors",
+        *native.FLAGS,
+        "play.c",
+        "psi.c",
+        "-lm",
+        "-o",
+        program,
+    ]
+    subprocess.run(command, check=True, cwd=out.parent)
+    given = frames(motion, tmp_path / "motion.bin", 30)
+    done = subprocess.run([program, out, given, tmp_path / "vertices.bin"], check=True, capture_output=True, text=True)
+    assert done.stdout.endswith("us a frame, one thread\n")
+    found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(30, -1, 3)
+    skirt = rounded(specialise.specialise(cj.load("skirt")))
+    short = motion._replace(rotations=motion.rotations[:30], translation=motion.translation[:30])
+    assert apart(found, skirt, short).max() < 3e-5
+    for broken, why in ((given, "not a .psi of this version"), (tmp_path / "none.psi", "cannot be opened")):
+        done = subprocess.run([program, broken, given, tmp_path / "v.bin"], capture_output=True, text=True)
+        assert done.returncode == 1 and str(broken) in done.stderr and why in done.stderr
+
+
+def hurt(data, structure, rng):
+    """A file damaged somewhere, mostly where its sizes are."""
+    kind = rng.integers(4)
+    if kind == 0:
+        return data[: rng.integers(len(data))]
+    if kind == 1:
+        return data + bytes(int(rng.integers(1, 200)))
+    damaged = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.choice(structure) if kind == 2 else rng.integers(len(data)))
+        damaged[at] = rng.integers(256)
+    return bytes(damaged)
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(5000, marks=pytest.mark.slow)])
+def test_a_damaged_file_is_refused_or_plays_on(count, motion, tmp_path):
+    program = made(tmp_path, *SANITIZERS)
+    data = native.to_c(random_model(skip=False), tmp_path / "g.psi").read_bytes()
+    words = np.frombuffer(data, np.int32)
+    structure = 4 * np.flatnonzero((words != 0) & (np.abs(words) < 1 << 20))  # sizes and indices
+    structure = np.concatenate([structure[structure < 1024], structure])
+    given, rng = frames(motion, tmp_path / "motion.bin", 5), np.random.default_rng(count)
+    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1"}
+    refused = 0
+    for _ in range(count):
+        (tmp_path / "hurt.psi").write_bytes(hurt(data, structure, rng))
+        done = subprocess.run(
+            [program, tmp_path / "hurt.psi", given, tmp_path / "v.bin"],
+            capture_output=True, text=True, timeout=20, env=environment,
+        )  # fmt: skip
+        assert done.returncode in (0, 1) and "runtime error" not in done.stderr, done.stderr
+        assert done.returncode == 0 or "hurt.psi: " in done.stderr
+        refused += done.returncode
+    assert 0.3 * count < refused < count

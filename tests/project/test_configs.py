@@ -1,0 +1,39 @@
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from toy import shrink
+
+from clothjax.config import Config
+from clothjax.files import configuration
+from clothjax.networks import animators, psi
+from clothjax.simulation import assembly
+from clothjax.training import laplacian_shapes, stage1
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+# like the quickstart, the same program on another mesh; what test_baselines.py has; one of a minute and a half
+LONG = ("pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_tshirt")
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in LONG), id=p.stem) for p in CONFIGS]
+)
+def test_every_configuration_takes_two_steps(path):
+    config = shrink(configuration.load(Config, path))
+    config = dataclasses.replace(config, motions=("walk_0",))
+    whole = assembly.assemble(config)
+    reel, _ = assembly.training_clips(whole)
+    if config.peer.network:
+        kept = psi.input_joints(whole.names, config.stage2)
+        state = stage1.init_peer(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
+        update = stage1.make_curriculum(whole.scene, reel, config, 2, animator=animators.baseline_animator(kept))
+    else:
+        state = stage1.init(whole.scene, reel, config)
+        update = stage1.make_curriculum(whole.scene, reel, config, 2)
+    before = jax.device_get(state.params)
+    state, metrics = update(state)
+    assert int(state.step) == 2
+    assert np.isfinite(metrics["loss"]).all() and not metrics["nonfinite"].any()
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.params)))
