@@ -110,10 +110,3 @@ class ClothState(NamedTuple):
     acceleration: Array  # [V, 3] m per frame^2
     latent: Array  # [L] the code that produced `position`
     change: Array  # [L] of the code in the last frame
-
-
-class EdgeSet(NamedTuple):
-    """Directed edges of one kind, sorted by receiver."""
-
-    senders: Array  # [E] int32
-    receivers: Array  # [E] int32

@@ -313,8 +313,8 @@ def inputs(runs: Runs) -> tuple[dict, Section]:
         figures["ours"] = {"code": code, "pose": pose, "wearer": rows - code - pose, "all": rows}
     if "ncs" in of_it:
         params = trained.network(of_it["ncs"])[1]["params"]
-        joints = len(params["dynamic"][0]["kernel"]) // params["local"][-1]["kernel"].shape[1]
-        code, static = len(params["unit"]["state"]["kernel"]), len(params["static"][0]["kernel"])
+        joints = len(params["dynamic"]["0"]["kernel"]) // params["local"]["1"]["kernel"].shape[1]
+        code, static = len(params["unit"]["state"]["kernel"]), len(params["static"]["0"]["kernel"])
         pose, wearer = 21 * joints, static - 9 * joints
         figures["ncs"] = {"code": code, "pose": pose, "wearer": wearer, "all": code + pose + wearer}
     columns = {"code": "carried from the last frame", "pose": "pose", "wearer": "body and cloth", "all": "all"}

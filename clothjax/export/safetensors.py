@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import Config
-from clothjax.files import configuration
+from clothjax.files import configuration, storage
 from clothjax.runtime.inference import Bounds, Layer, Model, Network, Wearer
 
+FORMAT = 1  # of the file; readers refuse a newer one
 STATIC = ("names", "parents", "kept", "moving")
 
 
@@ -25,7 +26,8 @@ def to_safetensors(model: Model, path: str | Path) -> Path:
         jax.tree_util.keystr(where, simple=True, separator="."): np.asarray(leaf, order="C")
         for where, leaf in jax.tree_util.tree_leaves_with_path(model)
     }
-    about = {name: getattr(model, name) for name in STATIC} | {"config": configuration.to_dict(model.config)}
+    about = {name: getattr(model, name) for name in STATIC}
+    about |= {"config": configuration.to_dict(model.config), "format": FORMAT}
     library.numpy.save_file(arrays, str(path), metadata={name: json.dumps(value) for name, value in about.items()})
     return Path(path)
 
@@ -42,6 +44,7 @@ def from_safetensors(path: str | Path) -> Model:
         with library.safe_open(str(path), framework="numpy") as file:
             about = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
             arrays = {name: jnp.asarray(file.get_tensor(name)) for name in file.keys()}
+        storage.refuse_newer(path, about.get("format", 1), FORMAT)
         config = configuration.from_dict(Config, about["config"], str(path))
         static = {name: tuple(about[name]) for name in STATIC}
 
@@ -67,6 +70,8 @@ def from_safetensors(path: str | Path) -> Model:
         )
         wearer = Wearer(*(arrays[f"wearer.{field}"] for field in Wearer._fields))
         return Model(network=network, wearer=wearer, faces=arrays["faces"], config=config, **static)
+    except storage.NewerFormat:
+        raise
     except (library.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(f"{path}: not a whole model in safetensors ({error}); convert it again") from error
 

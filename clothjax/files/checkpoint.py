@@ -124,9 +124,9 @@ def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None)
 
 
 def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint]:
-    """Parts of the newest undamaged checkpoint as nested dictionaries and lists, whatever their shapes are.
+    """Parts of the newest undamaged checkpoint as nested dictionaries, whatever their shapes are.
 
-    Fields of a NamedTuple come back as a dictionary.
+    Fields of a NamedTuple come back as a dictionary, and so do the elements of a list: by their numbers.
 
     Raises:
         ValueError: if there is no undamaged checkpoint, or it has no such part.
@@ -145,20 +145,10 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
         empty = [part for part in parts if not like[part]]
         if empty:
             raise ValueError(f"{path}: has no {', '.join(empty)}; it is of another kind of training")
-        like = lists(like)
         leaves = _leaves(about, named(like))
         return jax.tree.unflatten(jax.tree.structure(like), leaves.values()), about
 
     return _newest(Path(directory).resolve(), None, read_one)
-
-
-def lists(tree: Any) -> Any:
-    """Dictionaries with the keys 0, 1, 2, ... as lists."""
-    if not isinstance(tree, dict):
-        return tree
-    if tree.keys() == {str(i) for i in range(len(tree))}:  # not where an element without leaves left a gap
-        return [lists(tree[str(i)]) for i in range(len(tree))]
-    return {key: lists(value) for key, value in tree.items()}
 
 
 def set_aside(directory: str | Path, after: int) -> None:

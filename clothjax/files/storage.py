@@ -55,6 +55,16 @@ class Rig(NamedTuple):
     names: tuple[str, ...]  # [J]
 
 
+class NewerFormat(ValueError):
+    """A file was written by a newer version of this library."""
+
+
+def refuse_newer(path: str | Path, version: int, known: int) -> None:
+    """Raises NewerFormat for a file of a format that is newer than the known one."""
+    if version > known:
+        raise NewerFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")
+
+
 # Names
 
 

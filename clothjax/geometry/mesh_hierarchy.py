@@ -208,9 +208,9 @@ def _approximate_centres(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 def _neighbours(vertex_count: int, edges: np.ndarray) -> Neighbours:
     """Neighbours of every vertex, ascending."""
-    directed = topology.directed(edges)
-    ends = np.searchsorted(directed.receivers, np.arange(vertex_count + 1))
-    senders = directed.senders.tolist()
+    senders, receivers = topology.directed(edges)
+    ends = np.searchsorted(receivers, np.arange(vertex_count + 1))
+    senders = senders.tolist()
     return [senders[a:b] for a, b in zip(ends[:-1], ends[1:])]
 
 

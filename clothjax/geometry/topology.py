@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from clothjax.types import EdgeSet, Mesh
+from clothjax.types import Mesh
 
 
 def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
@@ -37,12 +37,12 @@ def edges(faces: np.ndarray) -> np.ndarray:
     return np.unique(_corners(_checked(faces))[1], axis=0).astype(np.int32).reshape(-1, 2)
 
 
-def directed(undirected: np.ndarray) -> EdgeSet:
-    """Return both directions of undirected edges [E, 2], sorted by receiver, then by sender."""
+def directed(undirected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return senders and receivers [2 E] int32 of both directions of edges [E, 2], sorted by receiver, then sender."""
     undirected = np.asarray(undirected, np.int32).reshape(-1, 2)
     both = np.concatenate([undirected, undirected[:, ::-1]])
     both = both[np.lexsort((both[:, 0], both[:, 1]))]
-    return EdgeSet(senders=np.ascontiguousarray(both[:, 0]), receivers=np.ascontiguousarray(both[:, 1]))
+    return np.ascontiguousarray(both[:, 0]), np.ascontiguousarray(both[:, 1])
 
 
 def components(vertex_count: int, links: np.ndarray) -> np.ndarray:

@@ -8,12 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import Config
-from clothjax.networks import baselines, decoder, normalisation, psi
+from clothjax.networks import baselines, decoder, normalisation, phi
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import Normalizers
-from clothjax.networks.phi import decode, latent_size
-from clothjax.networks.phi import step as phi_step
-from clothjax.networks.psi import constant_inputs, predict, window_inputs
+from clothjax.networks.psi import Psi, constant_inputs, window_inputs
 from clothjax.simulation.characters import Character
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
@@ -27,7 +25,7 @@ def memory_size(scene: Scene, config: Config) -> int:
     """Numbers L that an animator carries from frame to frame: the code, or a baseline's memory."""
     if config.peer.network:
         return baselines.memory_size(config)
-    left, channels = latent_size(scene, config.model)
+    left, channels = phi.latent_size(scene, config.model)
     return left * channels
 
 
@@ -35,7 +33,7 @@ def phi_animator(model: dict, scene: Scene, character: Character, config: Config
     """Phi, of `params` and `statistics`, as what moves a character's garment."""
 
     def step(inputs: StepInput) -> StepOutput:
-        return phi_step(model["params"], model["statistics"], scene, character, inputs, config.model, config.material)
+        return phi.step(model, scene, character, inputs, config.model, config.material)
 
     return Animator(memory_size(scene, config), step)
 
@@ -44,14 +42,14 @@ def baseline_animator(kept: np.ndarray) -> MakeAnimator:
     """A baseline's network, of `params`, as what moves a character's garment: on the joints `kept`."""
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
-        constants = psi.constant_inputs(character.betas, character.material, config.material)
-        free = jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
+        constants = constant_inputs(character.betas, character.material, config.material)
+        free = phi.free(scene)
+
+        network = baselines.network(config, len(free))
 
         def step(inputs: StepInput) -> StepOutput:
-            displaced, memory = baselines.displacement(
-                model["params"], inputs.state.latent, inputs.poses, character.joints, constants,
-                scene.body.parents, kept, config,
-            )  # fmt: skip
+            seen = baselines.inputs(inputs.poses, character.joints, constants, scene.body.parents, kept, config)
+            displaced, memory = network.apply({"params": model["params"]}, inputs.state.latent, **seen)
             moved = character.template, inputs.window.following.garment
             return StepOutput(decoder.vertices(displaced * free[:, None], *moved), memory)
 
@@ -102,14 +100,14 @@ def psi_animator(
             now = normalisation.normalise(normalizers.latent, inputs.state.latent)
             if gradients is not None:
                 params = learning_from(params, jnp.concatenate([now, gradients.pose @ pose, constants]))
-            latent = predict(params, now, pose, constants, config.stage2.latent_decay)
+            latent = Psi(config.stage2).apply({"params": params}, now, pose, constants)
             inside, _ = normalisation.bounded(latent, normalizers.latent.low, normalizers.latent.high)
             latent += jax.lax.stop_gradient(inside - latent)
             shown = latent
             if gradients is not None and gradients.code is not None:
                 shown = precondition(gradients.code, latent)
             code, shown = (normalisation.denormalise(normalizers.latent, z) for z in (latent, shown))
-            return StepOutput(decode({"garment": garment}, scene, character, shown, inputs.window, config.model), code)
+            return StepOutput(phi.decode(garment, scene, character, shown, inputs.window, config.model), code)
 
         return Animator(memory_size(scene, config), step)
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.body import rotation, skinning
-from clothjax.config import Config, PeerConfig
+from clothjax.config import Config
 from clothjax.networks import decoder, psi
-from clothjax.networks.mlp import Params, dense
+from clothjax.networks.mlp import Params
 from clothjax.types import Array, Pose
 
 STATIC = (64, 128, 256)  # NCS's static encoder, before its last layer
@@ -29,47 +29,45 @@ def memory_size(config: Config) -> int:
     return config.peer.width * (GRUS if config.peer.network == "snug" else 1)
 
 
+def network(config: Config, vertices: int) -> nn.Module:
+    """The configured network of a garment of V vertices.
+
+    It takes the memory [M] of the frame before and what `inputs` gives. It returns the canonical displacement
+    [V, 3] m and the memory that it leaves.
+    """
+    kinds = {"ncs": NCS, "snug": SNUG, "direct": Direct}
+    return kinds[config.peer.network](config, vertices)
+
+
 def init(key: Array, joints: int, constants: int, shapes: Array, config: Config) -> Params:
     """Parameters for so many joints that are inputs, and constants of a wearer.
 
     Args:
         shapes: [K, V, 3] m, blend shapes for Psi to start from; of the others, they only give the vertices.
     """
-    peer, vertices = config.peer, shapes.shape[1]
-    if peer.network == "direct":
-        return _init_direct(key, joints, constants, shapes, config)
-    make = {"ncs": _init_ncs, "snug": _init_snug}[peer.network]
-    return make(key, joints, constants, vertices, peer)
-
-
-def displacement(
-    params: Params,
-    memory: Array,
-    poses: Pose,
-    joints: Array,
-    constants: Array,
-    parents: np.ndarray,
-    kept: np.ndarray,
-    config: Config,
-) -> tuple[Array, Array]:
-    """Canonical displacement [V, 3] m at the last of three poses, and the memory [M] that it leaves.
-
-    Args:
-        memory: [M] of the frame before; joints: [J, 3] m, of the shaped body; constants: [C] of the wearer.
-        kept: joint indices, the root first.
-    """
+    seen = {
+        "ncs": {"static": jnp.zeros(9 * joints + constants), "dynamic": jnp.zeros((joints, 12))},
+        "snug": {"inputs": jnp.zeros(6 * joints + 3 + constants)},
+        "direct": {"pose": jnp.zeros(6 + 3 * 6 * joints + 3 * 3 * (joints - 1)), "constants": jnp.zeros(constants)},
+    }[config.peer.network]
+    memory = jnp.zeros(memory_size(config))
+    params = network(config, shapes.shape[1]).init(key, memory, **seen)["params"]
     if config.peer.network == "direct":
-        return _direct(params, memory, poses, joints, constants, parents, kept, config)
-    seen = inputs(poses, joints, constants, parents, kept, config)
-    run = _snug if config.peer.network == "snug" else _ncs
-    shapes, memory = run(params, memory, **seen)
-    return shapes.reshape(-1, 3), memory
+        params["garment"]["blendshapes"] = 0.1 * shapes
+    return params
 
 
 def inputs(
     poses: Pose, joints: Array, constants: Array, parents: np.ndarray, kept: np.ndarray, config: Config
 ) -> dict[str, Array]:
-    """What NCS or SNUG sees of three poses: `static` [S] and `dynamic` [Jk, 12], or `inputs` [N]."""
+    """What a network sees of three poses: NCS `static` [S] and `dynamic` [Jk, 12]; SNUG `inputs` [N]; Psi `pose` [P]
+    and `constants` [C].
+
+    Args:
+        joints: [J, 3] m, of the shaped body; constants: [C] of the wearer; kept: joint indices, the root first.
+    """
+    if config.peer.network == "direct":
+        return {"pose": psi.window_inputs(poses, joints, parents, kept, config.fps), "constants": constants}
     poses = _facing(poses, int(kept[0]))
     if config.peer.network == "snug":
         codes = rotation.to_6d(poses.rotations[2, kept]).reshape(-1)
@@ -105,108 +103,109 @@ def joint_inputs(poses: Pose, joints: Array, parents: np.ndarray, kept: np.ndarr
     return codes[2], jnp.concatenate([fps * (codes[2] - codes[1]), local], axis=-1)
 
 
-def _init_ncs(key: Array, joints: int, constants: int, vertices: int, config: PeerConfig) -> Params:
-    """With NCS's own random numbers: N(0, 0.05) for its layers, blend shapes as Glorot and Bengio."""
-    normal, width = nn.initializers.normal(0.05), config.width
-    keys = iter(jax.random.split(key, 16))
+class Layers(nn.Module):
+    """Dense layers of these sizes, a ReLU behind each, with NCS's own random numbers: N(0, 0.05)."""
 
-    def layers(sizes, bias):
-        return [
-            {"kernel": normal(next(keys), pair)} | ({"bias": jnp.zeros(pair[1])} if bias else {})
-            for pair in zip(sizes[:-1], sizes[1:])
-        ]
+    sizes: tuple[int, ...]
+    bias: bool = True
 
-    return {
-        "static": layers((9 * joints + constants, *STATIC, width), True),
-        "local": layers((12, LOCAL, LOCAL), False),
-        "dynamic": layers((LOCAL * joints, width, width), False),
-        "unit": _init_gru(next(keys), width, width, bias=False),
-        "decoder": layers((width, width, width, config.blendshapes), True),
-        "blendshapes": nn.initializers.glorot_normal()(next(keys), (config.blendshapes, 3 * vertices)),
-    }
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for index, size in enumerate(self.sizes):
+            layer = nn.Dense(size, self.bias, kernel_init=nn.initializers.normal(0.05), name=str(index))
+            x = nn.relu(layer(x))
+        return x
 
 
-def _ncs(params: Params, memory: Array, static: Array, dynamic: Array) -> tuple[Array, Array]:
-    """Displacements [3 V] m and the dynamic code [W], which is the memory: zero as long as nothing moves."""
-    for layer in params["static"]:
-        static = nn.relu(dense(layer, static))
-    for layer in params["local"]:
-        dynamic = nn.relu(dynamic @ layer["kernel"])
-    dynamic = dynamic.reshape(-1)
-    for layer in params["dynamic"]:
-        dynamic = nn.relu(dynamic @ layer["kernel"])
-    memory = _gru(params["unit"], memory, dynamic)
-    code = static + memory
-    for layer in params["decoder"]:
-        code = nn.relu(dense(layer, code))
-    return code @ params["blendshapes"], memory
+class NCS(nn.Module):
+    """The network of NCS, its blend shapes initialised as Glorot and Bengio."""
+
+    config: Config
+    vertices: int
+
+    @nn.compact
+    def __call__(self, memory: Array, static: Array, dynamic: Array) -> tuple[Array, Array]:
+        """Displacements [V, 3] m and the dynamic code [W], which is the memory: zero as long as nothing moves."""
+        peer, width = self.config.peer, self.config.peer.width
+        static = Layers((*STATIC, width), name="static")(static)
+        local = Layers((LOCAL, LOCAL), bias=False, name="local")(dynamic)
+        moving = Layers((width, width), bias=False, name="dynamic")(local.reshape(-1))
+        memory = GRU(width, bias=False, name="unit")(memory, moving)
+        weights = Layers((width, width, peer.blendshapes), name="decoder")(static + memory)
+        size = (peer.blendshapes, 3 * self.vertices)
+        return (weights @ self.param("blendshapes", nn.initializers.glorot_normal(), size)).reshape(-1, 3), memory
 
 
 # --- SNUG ---------------------------------------------------------------------------------------------------------
 
 
-def _init_snug(key: Array, joints: int, constants: int, vertices: int, config: PeerConfig) -> Params:
-    *keys, last = jax.random.split(key, GRUS + 1)
-    width = config.width
-    sizes = (6 * joints + 3 + constants, *(width,) * (GRUS - 1))
-    return {
-        "units": [_init_gru(k, size, width, bias=True) for k, size in zip(keys, sizes)],
-        "output": {
-            "kernel": nn.initializers.glorot_normal()(last, (width, 3 * vertices)),
-            "bias": jnp.zeros(3 * vertices),
-        },
-    }
+class Units(nn.Module):
+    """Gated recurrent units, one after the other."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, memory: Array, x: Array) -> Array:
+        """The new states [4 W] from those before and the inputs [N]."""
+        states = []
+        for index, state in enumerate(jnp.split(memory, GRUS)):
+            x = GRU(self.width, name=str(index))(state, x)
+            states.append(x)
+        return jnp.concatenate(states)
 
 
-def _snug(params: Params, memory: Array, inputs: Array) -> tuple[Array, Array]:
-    """Displacements [3 V] m and the states [4 W] of its units."""
-    states = []
-    for unit, state in zip(params["units"], jnp.split(memory, GRUS)):
-        inputs = _gru(unit, state, inputs)
-        states.append(inputs)
-    return dense(params["output"], inputs), jnp.concatenate(states)
+class SNUG(nn.Module):
+    """The recurrent network of SNUG."""
+
+    config: Config
+    vertices: int
+
+    @nn.compact
+    def __call__(self, memory: Array, inputs: Array) -> tuple[Array, Array]:
+        """Displacements [V, 3] m and the states [4 W] of its units."""
+        width = self.config.peer.width
+        memory = Units(width, name="units")(memory, inputs)
+        output = nn.Dense(3 * self.vertices, kernel_init=nn.initializers.glorot_normal(), name="output")
+        return output(memory[-width:]).reshape(-1, 3), memory
 
 
 # --- Psi without stage 1 ------------------------------------------------------------------------------------------
 
 
-def _init_direct(key: Array, joints: int, constants: int, shapes: Array, config: Config) -> Params:
-    keys, code = jax.random.split(key), config.model.latent
-    inputs = 6 + 3 * 6 * joints + 3 * 3 * (joints - 1)
-    return {
-        "predictor": psi.init(keys[0], code, inputs, constants, config.stage2),
-        "garment": decoder.init(keys[1], code, 0.1 * shapes, config.model),
-    }
-
-
-def _direct(params, memory, poses, joints, constants, parents, kept, config: Config) -> tuple[Array, Array]:
+class Direct(nn.Module):
     """Psi with codes and inputs as they are: without a teacher there is nothing to normalise codes by."""
-    inputs = psi.window_inputs(poses, joints, parents, kept, config.fps)
-    code = psi.predict(params["predictor"], memory, inputs, constants, config.stage2.latent_decay)
-    free = jnp.ones(params["garment"]["blendshapes"].shape[1])
-    return decoder.displacement(params["garment"], code, free, config.model), code
+
+    config: Config
+    vertices: int
+
+    def setup(self):
+        self.predictor = psi.Psi(self.config.stage2)
+        self.garment = decoder.Decoder(self.config.model, self.config.model.latent, self.vertices)
+
+    def __call__(self, memory: Array, pose: Array, constants: Array) -> tuple[Array, Array]:
+        """Displacements [V, 3] m and the code [L], which is the memory."""
+        code = self.predictor(memory, pose, constants)
+        return self.garment(code, jnp.ones(self.vertices)), code
 
 
 # --- gated recurrent units ----------------------------------------------------------------------------------------
 
 
-def _init_gru(key: Array, inputs: int, width: int, *, bias: bool) -> Params:
-    first, second = jax.random.split(key)
-    kernels = {
-        "input": {"kernel": nn.initializers.glorot_uniform()(first, (inputs, 3 * width))},
-        "state": {"kernel": nn.initializers.orthogonal()(second, (width, 3 * width))},
-    }
-    return {name: each | ({"bias": jnp.zeros(3 * width)} if bias else {}) for name, each in kernels.items()}
-
-
-def _gru(params: Params, state: Array, inputs: Array) -> Array:
+class GRU(nn.Module):
     """A gated recurrent unit (Cho et al. 2014), its reset gate after the product, with or without biases."""
 
-    def product(name: str, x: Array) -> list[Array]:
-        layer = params[name]
-        return jnp.split(dense(layer, x) if "bias" in layer else x @ layer["kernel"], 3)
+    width: int
+    bias: bool = True
 
-    (update, reset, new), (update_state, reset_state, new_state) = product("input", inputs), product("state", state)
-    update = nn.sigmoid(update + update_state)
-    new = jnp.tanh(new + nn.sigmoid(reset + reset_state) * new_state)
-    return update * state + (1.0 - update) * new
+    @nn.compact
+    def __call__(self, state: Array, x: Array) -> Array:
+        """The new state [W] from the one before and the inputs [N]."""
+
+        def product(name: str, rows: Array, kernel) -> list[Array]:
+            return jnp.split(nn.Dense(3 * self.width, self.bias, kernel_init=kernel, name=name)(rows), 3)
+
+        update, reset, new = product("input", x, nn.initializers.glorot_uniform())
+        update_state, reset_state, new_state = product("state", state, nn.initializers.orthogonal())
+        update = nn.sigmoid(update + update_state)
+        new = jnp.tanh(new + nn.sigmoid(reset + reset_state) * new_state)
+        return update * state + (1.0 - update) * new

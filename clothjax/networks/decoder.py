@@ -6,40 +6,55 @@ import jax.numpy as jnp
 
 from clothjax.body import skinning
 from clothjax.config import ModelConfig
-from clothjax.networks.mlp import Params, apply_mlp, init_mlp
+from clothjax.networks.mlp import MLP, Params
 from clothjax.types import Array
 
 
-def init(key: Array, latent: int, basis: Array, config: ModelConfig) -> Params:
-    """Parameters: a decoder whose last layer is near zero, and blend shapes [K, V, 3] m starting from `basis`.
+class Decoder(nn.Module):
+    """From a latent code [L] to a canonical displacement [V, 3] m.
 
-    A decoder of ordinary size would start the garment metres away: 4e4 J instead of a skinned garment's few.
+    The last layer is near zero at first: a decoder of ordinary size would start the garment metres away, with 4e4 J
+    instead of a skinned garment's few. The blend shapes are zero at first: training gives them a basis.
     """
-    sizes = (latent, *config.decoder, basis.shape[0])
-    params = {
-        "decoder": init_mlp(key, sizes, norm=False, last_gain=4e-4),
-        "blendshapes": jnp.asarray(basis),
-    }
-    if config.decoder_skip:
-        # each weight starts as one entry of the code
-        params["skip"] = jnp.eye(latent, basis.shape[0])
-    return params
+
+    config: ModelConfig
+    latent: int  # L
+    vertices: int  # V
+
+    def setup(self):
+        config = self.config
+        self.decoder = MLP((self.latent, *config.decoder, config.blendshapes), norm=False, last_gain=4e-4)
+        self.blendshapes = self.param("blendshapes", nn.initializers.zeros, (config.blendshapes, self.vertices, 3))
+        if config.decoder_skip:
+            # each weight starts as one entry of the code
+            self.skip = self.param("skip", lambda key, *shape: jnp.eye(*shape), self.latent, config.blendshapes)
+
+    def __call__(self, latent: Array, free: Array) -> Array:
+        """Canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is zero (pins)."""
+        shapes = self.blendshapes
+        flat = jnp.matmul(
+            self.blend_weights(latent), shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST
+        )
+        return flat.reshape(shapes.shape[1:]) * free[:, None]
+
+    def blend_weights(self, latent: Array) -> Array:
+        """Blend-shape weights [K] of a latent code [L]."""
+        weights = self.decoder(latent)
+        if self.config.decoder_skip:
+            weights = weights + latent @ self.skip
+        return nn.relu(weights) if self.config.blendshape_relu else weights
 
 
-def blend_weights(params: Params, latent: Array, config: ModelConfig) -> Array:
-    """Blend-shape weights [K] of a latent code [L]."""
-    weights = apply_mlp(params["decoder"], latent)
-    if config.decoder_skip:
-        weights = weights + latent @ params["skip"]
-    return nn.relu(weights) if config.blendshape_relu else weights
+def init(key: Array, latent: int, basis: Array, config: ModelConfig) -> Params:
+    """Parameters for codes of size L whose blend shapes start from a basis [K, V, 3] m."""
+    count = basis.shape[1]
+    params = Decoder(config, latent, count).init(key, jnp.zeros(latent), jnp.ones(count))["params"]
+    return params | {"blendshapes": jnp.asarray(basis)}
 
 
-def displacement(params: Params, latent: Array, free: Array, config: ModelConfig) -> Array:
-    """Canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is zero (pins)."""
-    weights = blend_weights(params, latent, config)
-    shapes = params["blendshapes"]
-    flat = jnp.matmul(weights, shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST)
-    return flat.reshape(shapes.shape[1:]) * free[:, None]
+def of(params: Params, config: ModelConfig) -> Decoder:
+    """The decoder that has such parameters."""
+    return Decoder(config, params["decoder"]["dense_0"]["kernel"].shape[0], params["blendshapes"].shape[1])
 
 
 def vertices(displaced: Array, template: Array, transforms: Array) -> Array:

@@ -36,6 +36,14 @@ class Features(NamedTuple):
     edges: dict[str, Array]  # [E, M] by edge set
     world: WorldFeatures | None  # None where there is no body
 
+    def columns(self) -> dict[str, list[Array]]:
+        """The features that share columns, and so statistics."""
+        nodes, pairs = [self.nodes], {}
+        if self.world is not None:
+            nodes.append(self.world.nodes)
+            pairs["world"] = [self.world.to_garment, self.world.to_body]
+        return {"nodes": nodes, "mesh": list(self.edges.values())} | pairs
+
 
 def compute(
     scene: Scene,
@@ -81,8 +89,8 @@ def compute(
         extra, drifted = _canonical(character, state, window, contact, held, force)
         edge_points |= {"held": held, "drifted": drifted}
     edges = {
-        name: mesh_edges(senders, receivers, edge_points, character.template, turn, timestep, inputs)
-        for name, (senders, receivers) in scene.graph.items()
+        name: mesh_edges(graph.senders, graph.receivers, edge_points, character.template, turn, timestep, inputs)
+        for name, graph in scene.graph.items()
     }
     world = None
     if contact is not None:

@@ -1,40 +1,25 @@
 """Encoder MLPs and message-passing blocks on several edge sets (HOOD; Pfaff et al. 2021)."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import field
 from typing import Any, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import jraph
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from clothjax.config import Stack
-from clothjax.networks.mlp import Params, init_mlp, mlp_tail, mlp_tail_in_chunks, times
-from clothjax.types import Array, EdgeSet
+from clothjax.config import ModelConfig, Stack
+from clothjax.networks import normalisation
+from clothjax.networks.graph_features import Features
+from clothjax.networks.mlp import MLP
+from clothjax.types import Array
 
 ARRIVED = "arrived"  # messages summed at their receivers, which the backward pass keeps
-
-
-# --- message passing ----------------------------------------------------------------------------------------------
-
-
-def init_processor(key: Array, stacks: tuple[Stack, ...], width: int, layers: int, body: bool = True) -> list[Params]:
-    """Parameters of each stack of blocks, stacked along a leading axis so that depth is a scan."""
-    hidden = (width,) * layers
-
-    def block(key: Array, edges: tuple[str, ...]) -> Params:
-        names = sorted((*edges, "world") if body else edges)
-        keys = jax.random.split(key, len(names) + 1)
-        params = {f"edge_{name}": init_mlp(k, (3 * width, *hidden)) for name, k in zip(names, keys[1:])}
-        params["node"] = init_mlp(keys[0], ((1 + len(names)) * width, *hidden))
-        return params
-
-    keys = jax.random.split(key, len(stacks))
-    return [
-        jax.vmap(lambda k, s=stack: block(k, s.edges))(jax.random.split(key, stack.blocks))
-        for stack, key in zip(stacks, keys)
-    ]
+TYPES, LEVELS = (4, 9), (8, 4)  # rows and columns of the embeddings of node types and levels
+Graphs = Mapping[str, jraph.GraphsTuple]  # edge sets, sorted by receiver
 
 
 class World(NamedTuple):
@@ -46,97 +31,214 @@ class World(NamedTuple):
     pairs: dict[str, Array]  # latents [V, W]: `to_garment`, and `to_body` if body nodes are to be updated
 
 
-def process(
-    params: list[Params],
-    stacks: tuple[Stack, ...],
-    nodes: Array,
-    edges: dict[str, Array],
-    world: World | None,
-    graph: dict[str, EdgeSet],
-    level: np.ndarray,
-    *,
-    remat: bool,
-) -> Array:
-    """Garment node latents [V, W] after all message-passing blocks.
+class Latents(NamedTuple):
+    """The latents that pass from block to block."""
+
+    nodes: Array  # [V, W] of the garment
+    body: Array | None  # [S, W]; None where there is no body
+    edges: dict[str, Array]  # [E, W] by edge set
+    pairs: dict[str, Array]  # [R, W] of the vertices in reach, as in `World`
+
+
+# --- message passing ----------------------------------------------------------------------------------------------
+
+
+class Block(nn.Module):
+    """One residual message-passing block. First layers are applied before their inputs are gathered or put side by
+    side."""
+
+    width: int
+    layers: int
+    graphs: Graphs = field(repr=False)  # among the vertices in reach
+    rows: np.ndarray | None = field(repr=False)  # [R] the vertices in reach; None: all
+    body: bool = True
+    in_chunks: bool = False  # MLPs run over some rows at a time and are recomputed in the backward pass
+
+    def setup(self):
+        names = sorted((*self.graphs, "world") if self.body else self.graphs)
+        hidden = (self.width,) * self.layers
+        self.edge = {name: MLP((3 * self.width, *hidden)) for name in names}
+        self.node = MLP(((1 + len(names)) * self.width, *hidden))
+
+    def __call__(self, latents: Latents, slots: Array | None, active: Array | None) -> tuple[Latents, None]:
+        """The latents after the block.
+
+        Args:
+            slots, active: [R] as in `World`, of the vertices in reach.
+        """
+        nodes, body, edges, pairs = latents
+        here, new_body = self._reached(nodes), body
+        arrived, new_edges, new_pairs = {}, {}, {}
+        for name, graph in self.graphs.items():
+            message = self._message(name, here, here, edges[name], graph.receivers, graph.senders)
+            arrived[name] = jraph.segment_sum(message, graph.receivers, len(here), indices_are_sorted=True)
+            new_edges[name] = edges[name] + message
+        if "to_garment" in pairs:
+            message = self._message("world", here, body, pairs["to_garment"], None, slots)
+            arrived["world"] = jnp.where(active[:, None], message, 0.0)
+            new_pairs["to_garment"] = pairs["to_garment"] + arrived["world"]
+        if "to_body" in pairs:
+            message = self._message("world", body, here, pairs["to_body"], slots, None)
+            back = jnp.where(active[:, None], message, 0.0)
+            new_pairs["to_body"] = pairs["to_body"] + back
+            new_body = body + self._updated(body, jraph.segment_sum(back, slots, len(body)), None)
+        everything = checkpoint_name(jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1), ARRIVED)
+        return Latents(nodes + self._updated(nodes, everything, self.rows), new_body, new_edges, new_pairs), None
+
+    @nn.nowrap
+    def _reached(self, rows: Array) -> Array:
+        return rows if self.rows is None else rows[self.rows]
+
+    @nn.nowrap
+    def _updated(self, nodes: Array, arrived: Array, rows: np.ndarray | None) -> Array:
+        """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
+        first = self.node.dense[0]
+        own = first.product(nodes) + first.bias[None]
+        added = first.product(arrived, begin=first.inputs - arrived.shape[-1])
+        return self.node.tail(own + added if rows is None else own.at[rows].add(added), self.in_chunks)
+
+    @nn.nowrap
+    def _message(self, name: str, targets, sources, latent, target_index, source_index) -> Array:
+        """MLP([target, source, edge]) with the node parts of its first layer multiplied before the gather."""
+        mlp, width = self.edge[name], self.width
+        first = mlp.dense[0]
+        target, source = first.product(targets), first.product(sources, begin=width)
+        target = target if target_index is None else target[target_index]
+        source = source if source_index is None else source[source_index]
+        return mlp.tail(target + source + first.product(latent, begin=2 * width) + first.bias[None], self.in_chunks)
+
+
+class Processor(nn.Module):
+    """Stacks of message-passing blocks. A stack is a scan over parameters with a leading axis.
 
     In a stack without the fine mesh only the vertices of its coarse levels send and receive, from the body too; the
     others go through the node MLP alone.
-
-    Args:
-        params: of `init_processor`.
-        nodes: [V, W] of the garment.
-        edges: latents [E, W] by edge set, on `graph`.
-        world: None where there is no body.
-        level: [V] the deepest coarse level of a vertex, plus one; 0 for none.
     """
-    body, pairs = (None, {}) if world is None else (world.nodes, world.pairs)
-    tail = mlp_tail_in_chunks if remat and jax.default_backend() == "cpu" else mlp_tail
-    for stack, stacked in zip(stacks, params):
-        rows, among = _reached(stack, graph, level)
-        slots, active = (None, None) if world is None else (world.slots[rows], world.active[rows])
 
-        def block(carry, p, rows=rows, among=among, slots=slots, active=active):
-            return _block(p, *carry, rows, among, slots, active, tail), None
+    stacks: tuple[Stack, ...]
+    width: int
+    layers: int
+    level: np.ndarray = field(repr=False)  # [V] the deepest coarse level of a vertex, plus one; 0 for none
+    remat: bool = False  # recompute blocks in the backward pass
+    block: type[nn.Module] = Block
 
-        if remat:
-            block = jax.checkpoint(
-                block, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(ARRIVED)
+    @nn.compact
+    def __call__(self, nodes: Array, graphs: Graphs, world: World | None) -> Array:
+        """Garment node latents [V, W] after all blocks.
+
+        Args:
+            nodes: [V, W] of the garment.
+            graphs: edge sets with their latents [E, W]; senders and receivers are on the host.
+            world: None where there is no body.
+        """
+        block = self.block
+        if self.remat:
+            policy = jax.checkpoint_policies.save_only_these_names(ARRIVED)
+            block = nn.remat(block, prevent_cse=False, policy=policy)
+        edges = {name: graph.edges for name, graph in graphs.items()}
+        body, pairs = (None, {}) if world is None else (world.nodes, world.pairs)
+        for index, stack in enumerate(self.stacks):
+            rows, among = reached(stack, graphs, self.level)
+            here = slice(None) if rows is None else rows
+            scanned = nn.scan(
+                block,
+                variable_axes={"params": 0},
+                split_rngs={"params": True},
+                in_axes=nn.broadcast,
+                length=stack.blocks,
             )
-        carry = (nodes, body, {name: edges[name] for name in stack.edges}, {k: x[rows] for k, x in pairs.items()})
-        (nodes, body, updated, near), _ = jax.lax.scan(block, carry, stacked)
-        edges = edges | updated
-        pairs = {name: x.at[rows].set(near[name]) for name, x in pairs.items()}
-    return nodes
+            blocks = scanned(
+                self.width, self.layers, among, rows, world is not None,
+                self.remat and jax.default_backend() == "cpu", name=str(index),
+            )  # fmt: skip
+            latents = Latents(
+                nodes, body, {name: edges[name] for name in stack.edges}, {k: x[here] for k, x in pairs.items()}
+            )
+            slots, active = (None, None) if world is None else (world.slots[here], world.active[here])
+            (nodes, body, updated, near), _ = blocks(latents, slots, active)
+            edges = edges | updated
+            pairs = {name: x.at[here].set(near[name]) for name, x in pairs.items()}
+        return nodes
 
 
-def _reached(stack: Stack, graph: dict[str, EdgeSet], level: np.ndarray) -> tuple[Any, dict[str, EdgeSet]]:
-    """Which vertices have edges in a stack, and its edges, numbered among these."""
+def reached(stack: Stack, graphs: Graphs, level: np.ndarray) -> tuple[np.ndarray | None, Graphs]:
+    """The vertices [R] that have edges in a stack, or None for all, and its edge sets, numbered among these."""
+    among = {name: graphs[name]._replace(edges=None) for name in stack.edges}
     if stack.lowest_level == 0:
-        return slice(None), {name: graph[name] for name in stack.edges}
-    reached = np.asarray(level) >= stack.lowest_level
-    number = np.cumsum(reached, dtype=np.int32) - 1
-    return np.flatnonzero(reached), {name: EdgeSet(*(number[ends] for ends in graph[name])) for name in stack.edges}
+        return None, among
+    within = np.asarray(level) >= stack.lowest_level
+    number = np.cumsum(within, dtype=np.int32) - 1
+    count = np.array([within.sum()], np.int32)
+    return np.flatnonzero(within), {
+        name: graph._replace(senders=number[graph.senders], receivers=number[graph.receivers], n_node=count)
+        for name, graph in among.items()
+    }
 
 
-def _block(params, nodes, body, edges, pairs, rows, graph, slots, active, tail):
-    """One residual block. First layers are applied before what they read is gathered or put side by side.
+class Encoder(nn.Module):
+    """An MLP for every kind of rows, by its name."""
 
-    Args:
-        tail: the other layers of an MLP, `_mlp_tail` in one of its forms.
+    width: int
+    layers: int
+
+    @nn.compact
+    def __call__(self, rows: dict[str, Any]) -> dict[str, Any]:
+        """Latents [N, W] in the place of rows [N, columns]: any number of arrays of each kind."""
+        hidden = (self.width,) * self.layers
+        found = {}
+        for name, parts in rows.items():
+            mlp = MLP((jax.tree.leaves(parts)[0].shape[-1], *hidden), name=name)
+            found[name] = jax.tree.map(mlp, parts)
+        return found
+
+
+class MessagePassing(nn.Module):
+    """Encode and Process: the node latents of a garment from features.
+
+    Running statistics of the features are in the collection `statistics`; `phi.observe` updates them.
     """
-    here, new_body = nodes[rows], body
-    arrived, new_edges, new_pairs = {}, {}, {}
-    for name, latent in edges.items():
-        senders, receivers = graph[name]
-        message = _message(params[f"edge_{name}"], here, here, latent, receivers, senders, tail)
-        arrived[name] = jraph.segment_sum(message, receivers, len(here), indices_are_sorted=True)
-        new_edges[name] = latent + message
-    if "to_garment" in pairs:
-        message = _message(params["edge_world"], here, body, pairs["to_garment"], None, slots, tail)
-        arrived["world"] = jnp.where(active[:, None], message, 0.0)
-        new_pairs["to_garment"] = pairs["to_garment"] + arrived["world"]
-    if "to_body" in pairs:
-        message = _message(params["edge_world"], body, here, pairs["to_body"], slots, None, tail)
-        back = jnp.where(active[:, None], message, 0.0)
-        new_pairs["to_body"] = pairs["to_body"] + back
-        at_body = jraph.segment_sum(back, slots, len(body))
-        new_body = body + _node_update(params["node"], body, slice(None), at_body, tail)
-    everything = checkpoint_name(jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1), ARRIVED)
-    return nodes + _node_update(params["node"], nodes, rows, everything, tail), new_body, new_edges, new_pairs
 
+    config: ModelConfig
+    graphs: Graphs = field(repr=False)  # of the garment, without latents
+    level: np.ndarray = field(repr=False)  # [V] int32, as in `Processor`
+    pinned: np.ndarray = field(repr=False)  # [V] bool
+    block: type[nn.Module] = Block
 
-def _node_update(params: Params, nodes: Array, rows: Any, arrived: Array, tail: Callable) -> Array:
-    """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
-    kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
-    own = times(nodes, kernel[: nodes.shape[-1]]) + bias[None]
-    return tail(params, own.at[rows].add(times(arrived, kernel[-arrived.shape[-1] :])))
+    @nn.compact
+    def __call__(self, seen: Features) -> Array:
+        """Node latents [V, W] of the garment."""
+        config, world = self.config, seen.world
+        type_embedding = self.param("type_embedding", nn.initializers.normal(1.0), TYPES)
+        level_embedding = self.param("level_embedding", nn.initializers.normal(1.0), LEVELS)
+        columns = {name: parts[0].shape[-1] for name, parts in seen.columns().items()}
+        statistics = {
+            name: self.variable("statistics", name, normalisation.empty_statistics, count).value
+            for name, count in columns.items()
+        }
 
+        def scaled(name: str, rows: Array) -> Array:
+            return normalisation.standardise(statistics[name], rows)
 
-def _message(params, targets, sources, latent, target_index, source_index, tail):
-    """MLP([target, source, edge]) with the node parts of its first layer multiplied before the gather."""
-    width = latent.shape[-1]
-    kernel, bias = params["dense_0"]["kernel"], params["dense_0"]["bias"]
-    target, source = times(targets, kernel[:width]), times(sources, kernel[width : 2 * width])
-    target = target if target_index is None else target[target_index]
-    source = source if source_index is None else source[source_index]
-    return tail(params, target + source + times(latent, kernel[2 * width :]) + bias[None])
+        def nodes(rows: Array, kind: Array, level: Array) -> Array:
+            embedded = jnp.concatenate([type_embedding[kind], level_embedding[level]], axis=-1)
+            return jnp.concatenate([scaled("nodes", rows), embedded], axis=-1)
+
+        rows: dict[str, Any] = {
+            "nodes": {"garment": nodes(seen.nodes, 3 * np.asarray(self.pinned, np.int32), jnp.asarray(self.level))}
+        }
+        rows |= {name: scaled("mesh", x) for name, x in seen.edges.items()}
+        if world is not None:
+            ones = jnp.ones(len(world.nodes), jnp.int32)
+            rows["nodes"]["body"] = nodes(world.nodes, ones, 0 * ones)
+            rows["world"] = {"to_garment": scaled("world", world.to_garment)}
+            if config.body_nodes == "updated":
+                rows["world"]["to_body"] = scaled("world", world.to_body)
+        latents = Encoder(config.width, config.mlp_layers, name="encoder")(rows)
+        beside = None
+        if world is not None:
+            beside = World(latents["nodes"]["body"], world.slots, world.active, latents["world"])
+        graphs = {name: graph._replace(edges=latents[name]) for name, graph in self.graphs.items()}
+        processor = Processor(
+            config.processor, config.width, config.mlp_layers, self.level, config.remat, self.block, name="processor"
+        )
+        return processor(latents["nodes"]["garment"], graphs, beside)

@@ -1,5 +1,6 @@
 """Dense layers, MLPs, layer normalisation."""
 
+from collections.abc import Callable
 from functools import partial
 
 import flax.linen as nn
@@ -12,73 +13,83 @@ Params = dict
 CHUNK = 1024  # rows of an MLP at a time, where a CPU recomputes it: its layers then stay in the cache
 
 
+def scaled(gain: float) -> Callable:
+    """An initialiser of kernels with variance gain / inputs; the gain 2 suits a ReLU behind the layer."""
+    return nn.initializers.variance_scaling(gain, "fan_in", "truncated_normal")
+
+
 # --- multilayer perceptrons ---------------------------------------------------------------------------------------
 
 
-def init_dense(key: Array, inputs: int, outputs: int, gain: float = 2.0) -> Params:
-    """A dense layer with kernel variance gain / inputs and zero bias; the gain 2 suits a ReLU behind it."""
-    kernel = nn.initializers.variance_scaling(gain, "fan_in", "truncated_normal")
-    return nn.Dense(outputs, kernel_init=kernel).init(key, jnp.zeros((1, inputs)))["params"]
+class Dense(nn.Module):
+    """A dense layer whose kernel can be applied in parts: before what it reads is gathered or put side by side."""
+
+    inputs: int
+    outputs: int
+    gain: float = 2.0
+
+    def setup(self):
+        self.kernel = self.param("kernel", scaled(self.gain), (self.inputs, self.outputs))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.outputs,))
+
+    def __call__(self, x: Array) -> Array:
+        """[..., outputs] of x [..., inputs]."""
+        return self.product(x) + self.bias.reshape((1,) * (x.ndim - 1) + self.bias.shape)
+
+    def product(self, x: Array, begin: int = 0) -> Array:
+        """x [..., n] times the n rows of the kernel from `begin` on, without the bias."""
+        return x @ self.kernel[begin : begin + x.shape[-1]]
 
 
-def dense(params: Params, x: Array) -> Array:
-    """A dense layer on [..., inputs]."""
-    bias = params["bias"]
-    return times(x, params["kernel"]) + bias.reshape((1,) * (x.ndim - 1) + bias.shape)
+class LayerNorm(nn.Module):
+    """Rows [N, W] with mean 0 and variance 1, times a scale [W] plus a bias [W]."""
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        scale = self.param("scale", nn.initializers.ones, (x.shape[-1],))
+        bias = self.param("bias", nn.initializers.zeros, (x.shape[-1],))
+        return _affine(jax.nn.standardize(x, epsilon=1e-5), scale, bias)
 
 
-def times(x: Array, kernel: Array) -> Array:
-    """x [..., inputs] times a kernel [inputs, outputs]; where that is in bfloat16, so is the product."""
-    if kernel.dtype == jnp.bfloat16:
-        return (x.astype(jnp.bfloat16) @ kernel).astype(x.dtype)
-    return x @ kernel
+class MLP(nn.Module):
+    """Dense layers through `sizes`, inputs first, with ReLU between them and a LayerNorm at the end if `norm`."""
 
+    sizes: tuple[int, ...]
+    norm: bool = True
+    last_gain: float = 1.0
 
-def in_bfloat16(params: Params) -> Params:
-    """The same layers with their kernels in bfloat16, so that products are, and the gradients of these."""
+    def setup(self):
+        gains = (*(2.0,) * (len(self.sizes) - 2), self.last_gain)
+        self.dense = [Dense(*each) for each in zip(self.sizes[:-1], self.sizes[1:], gains, strict=True)]
+        self.layer_norm = LayerNorm(name="norm") if self.norm else None
 
-    def rounded(path, leaf):
-        return leaf.astype(jnp.bfloat16) if path[-1] == jax.tree_util.DictKey("kernel") else leaf
+    def __call__(self, x: Array) -> Array:
+        """[N, outputs] of x [N, inputs]; without a LayerNorm, [..., outputs] of [..., inputs]."""
+        return self.tail(self.dense[0](x))
 
-    return jax.tree_util.tree_map_with_path(rounded, params)
+    def tail(self, first: Array, in_chunks: bool = False) -> Array:
+        """The outputs from the pre-activation [N, W] of the first layer.
 
+        Args:
+            in_chunks: some rows at a time, and nothing but `first` is kept for the backward pass.
+        """
+        if in_chunks and not self.is_initializing():
+            return self._in_chunks(first)
+        x = first
+        for layer in self.dense[1:]:
+            x = layer(nn.relu(x))
+        return self.layer_norm(x) if self.norm else x
 
-def init_mlp(key: Array, sizes: tuple[int, ...], norm: bool = True, last_gain: float = 1.0) -> Params:
-    """An MLP through `sizes`, ReLU between the layers, with a LayerNorm at the end if `norm`."""
-    keys = jax.random.split(key, len(sizes) - 1)
-    last = len(sizes) - 2
-    params = {
-        f"dense_{i}": init_dense(keys[i], sizes[i], sizes[i + 1], last_gain if i == last else 2.0)
-        for i in range(len(sizes) - 1)
-    }
-    if norm:
-        params["norm"] = {"scale": jnp.ones(sizes[-1]), "bias": jnp.zeros(sizes[-1])}
-    return params
-
-
-def apply_mlp(params: Params, x: Array) -> Array:
-    """The MLP of `init_mlp` on [N, inputs], or without a LayerNorm on [..., inputs]."""
-    return mlp_tail(params, dense(params["dense_0"], x))
-
-
-def mlp_tail(params: Params, first: Array) -> Array:
-    """An MLP from the pre-activation of its first layer."""
-    x, layers = first, sum(name.startswith("dense") for name in params)
-    for i in range(1, layers):
-        x = dense(params[f"dense_{i}"], nn.relu(x))
-    if "norm" not in params:
-        return x
-    return _affine(jax.nn.standardize(x, epsilon=1e-5), params["norm"]["scale"], params["norm"]["bias"])
-
-
-def mlp_tail_in_chunks(params: Params, first: Array) -> Array:
-    """`_mlp_tail`, some rows at a time, that keeps nothing but `first` for the backward pass."""
-    count, width = first.shape
-    chunks = -(-count // CHUNK)
-    rows = -(-count // chunks)
-    parts = jnp.pad(first, ((0, chunks * rows - count), (0, 0))).reshape(chunks, rows, width)
-    done = jax.lax.map(jax.checkpoint(partial(mlp_tail, params), prevent_cse=False), parts)
-    return done.reshape(chunks * rows, -1)[:count]
+    @nn.nowrap
+    def _in_chunks(self, first: Array) -> Array:
+        count, width = first.shape
+        chunks = -(-count // CHUNK)
+        rows = -(-count // chunks)
+        parts = jnp.pad(first, ((0, chunks * rows - count), (0, 0))).reshape(chunks, rows, width)
+        mlp, variables = self.unbind()
+        tail = partial(mlp.apply, variables, method="tail")
+        done = jax.lax.map(jax.checkpoint(tail, prevent_cse=False), parts)
+        return done.reshape(chunks * rows, -1)[:count]
 
 
 @jax.custom_vjp

@@ -1,5 +1,6 @@
 """Psi's network (METHOD.md, Psi): the next latent code from the current one and what a game engine knows."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from clothjax.body import rotation, skinning
 from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.material import material_inputs, scaled
-from clothjax.networks.mlp import Params, apply_mlp, init_mlp
+from clothjax.networks.mlp import MLP, Params
 from clothjax.networks.normalisation import bounded
 from clothjax.types import Array, Material, Pose
 
@@ -66,15 +67,24 @@ def bounded_constants(constants: Array, config: Config) -> tuple[Array, Array]:
     return bounded(constants, jnp.concatenate([-betas, 0 * materials]), jnp.concatenate([betas, materials]))
 
 
+class Psi(nn.Module):
+    """The latent predictor. Its last layer starts small, so that it first keeps the code as it is."""
+
+    config: Stage2Config
+
+    @nn.compact
+    def __call__(self, latent: Array, pose: Array, constants: Array) -> Array:
+        """The next code [L] in standard deviations, from the current one, normalised pose inputs [P] and constants [C].
+
+        A part `latent_decay` of the code is forgotten unless the network gives it back, so that no direction of the
+        code drifts.
+        """
+        inputs = jnp.concatenate([latent, pose, constants])
+        mlp = MLP((len(inputs), *self.config.hidden, len(latent)), norm=False, last_gain=0.01)
+        nn.share_scope(self, mlp)  # its layers are Psi's own, as in older models
+        return (1.0 - self.config.latent_decay) * latent + mlp(inputs)
+
+
 def init(key: Array, latent: int, pose: int, constants: int, config: Stage2Config) -> Params:
-    """Parameters of the predictor; its last layer starts small, so that it first keeps the code as it is."""
-    sizes = (latent + pose + constants, *config.hidden, latent)
-    return init_mlp(key, sizes, norm=False, last_gain=0.01)
-
-
-def predict(params: Params, latent: Array, pose: Array, constants: Array, decay: float) -> Array:
-    """The next latent code [L] in standard deviations, from the current one and normalised inputs.
-
-    A part `decay` of the code is forgotten unless the network gives it back, so that no direction of the code drifts.
-    """
-    return (1.0 - decay) * latent + apply_mlp(params, jnp.concatenate([latent, pose, constants]))
+    """Parameters of Psi for so many codes L, pose inputs P and constants C."""
+    return Psi(config).init(key, jnp.zeros(latent), jnp.zeros(pose), jnp.zeros(constants))["params"]

@@ -22,6 +22,7 @@ MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
 HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
+FORMAT = 2  # of a packed model; in 1 no number was written, all else is the same
 LARGE = 2000  # entries of a matrix that is worth eight bits
 
 
@@ -167,7 +168,7 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         "predictor": predictor,
         "normalizers": {name: each._asdict() for name, each in normalizers._asdict().items()},
     }
-    arrays = {}
+    arrays = {"format": np.int32(FORMAT)}
     for name, leaf in checkpoint.named(parts).items():
         leaf = np.asarray(leaf)
         if name in HALVED:
@@ -212,9 +213,9 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
     tree: dict = {}
     try:
         with np.load(path, allow_pickle=False) as file:
-            for name in file.files:
-                if name.endswith("|scale"):
-                    continue
+            storage.refuse_newer(path, int(file["format"]) if "format" in file.files else 1, FORMAT)
+            names = [name for name in file.files if name != "format" and not name.endswith("|scale")]
+            for name in names:
                 leaf = file[name]
                 if leaf.dtype == np.int8:
                     leaf = leaf * file[f"{name}|scale"]
@@ -223,14 +224,15 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
                 for key in above:
                     node = node.setdefault(key, {})
                 node[last] = leaf.astype(np.float32)
-        parts = checkpoint.lists(tree)
-        parts["phi"]["garment"]  # all else of a model needs it
+        tree["phi"]["garment"]  # all else of a model needs it
         return config, {
-            "phi": parts["phi"],
-            "predictor": parts["predictor"],
-            "statistics": _statistics(parts["statistics"]),
-            "normalizers": _normalizers(parts["normalizers"]),
+            "phi": tree["phi"],
+            "predictor": tree["predictor"],
+            "statistics": _statistics(tree["statistics"]),
+            "normalizers": _normalizers(tree["normalizers"]),
         }
+    except storage.NewerFormat:
+        raise
     except storage.UNREADABLE as error:
         raise ValueError(
             f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"

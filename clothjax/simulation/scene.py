@@ -2,13 +2,14 @@
 
 from typing import NamedTuple
 
+import jraph
 import numpy as np
 from scipy.spatial import cKDTree
 
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
 from clothjax.geometry.proximity import Patches, patches
-from clothjax.types import Array, Body, EdgeSet, Garment, Mesh
+from clothjax.types import Array, Body, Garment, Mesh
 
 NEAR = 0.05  # m, body beside the garment
 NEAR_SHARE = 0.05  # of a joint's vertices beside the garment, for the joint to matter
@@ -28,7 +29,7 @@ class Scene(NamedTuple):
     body: Body  # only the vertices that the garment can reach; none where there is no body to touch
     still: bool  # whether the body never moves
     mesh: Mesh  # what has energy: of faces, hinges and edges those with a vertex that is not pinned
-    graph: dict[str, EdgeSet]  # `mesh`, and the coarse levels in use
+    graph: dict[str, jraph.GraphsTuple]  # `mesh`, and the coarse levels in use: edges sorted by receiver
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]
     patches: Patches | None  # of the body
@@ -52,8 +53,9 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
                 f"coarse level {index} of this garment ({len(garment.vertices)} vertices) is empty; "
                 f"leave coarse{index} out of model.processor"
             )
-    graph = {"mesh": topology.directed(topology.edges(faces))}
-    graph |= {f"coarse{i}": topology.directed(level) for i, level in enumerate(levels) if f"coarse{i}" in used}
+    count = len(garment.vertices)
+    graph = {"mesh": edge_set(topology.edges(faces), count)}
+    graph |= {f"coarse{i}": edge_set(level, count) for i, level in enumerate(levels) if f"coarse{i}" in used}
     hierarchy = mesh_hierarchy.hierarchy(
         faces,
         len(garment.vertices),
@@ -74,6 +76,13 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
         patches=patches(within.vertices, within.faces) if touchable else None,
         garment_patches=patches(garment.vertices, faces),
     )
+
+
+def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:
+    """Both directions of undirected edges [E, 2] among V vertices, sorted by receiver, as a graph without features."""
+    senders, receivers = topology.directed(undirected)
+    counts = (np.array([n], np.int32) for n in (vertices, len(senders)))
+    return jraph.GraphsTuple(None, None, receivers, senders, None, *counts)
 
 
 def reachable(body: Body, garment: Garment, reach: float) -> Body:

@@ -52,7 +52,7 @@ def measure(
         step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config)
 
         def energy(latent: Array) -> Array:
-            new = phi.decode(model["params"], scene, character, latent, window, config.model)
+            new = phi.decode(model["params"]["garment"], scene, character, latent, window, config.model)
             return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
         return descent.nearest_convex(descent.hessian(energy, latents[-1]))

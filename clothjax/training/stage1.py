@@ -78,13 +78,15 @@ def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     basis = laplacian_shapes.laplacian(scene, config) if shapes is None else shapes
-    # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
     example = jax.eval_shape(lambda k: first_step(scene, begin(k, scene, clips, config), clips, config), key).seen
-    params = jax.jit(lambda k: phi.init(k, scene, example, 0.1 * basis, config.model))(model_key)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), example)
+    model = jax.jit(lambda k: phi.Phi(config.model, scene).init(k, zeros))(model_key)
+    params = model["params"]
+    # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
+    params["garment"]["blendshapes"] = jnp.asarray(0.1 * basis)
     if config.model.latent_update == "descent":
         params["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(params["garment"])
-    statistics = phi.init_statistics(example)
-    return starting(params, statistics, key, pool_key, scene, clips, config)
+    return starting(params, model["statistics"], key, pool_key, scene, clips, config)
 
 
 def init_peer(scene: Scene, clips: Clips, kept: np.ndarray, shapes: Array, config: Config) -> TrainingState:
@@ -128,14 +130,13 @@ def preconditioned(state: TrainingState, inverse: Array) -> TrainingState:
 def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
     """The inverse Hessian [L, L] in 1/J of `rollout.rest_energy` over codes near zero."""
     energy = time_step.rest_energy(scene, config)
-    free = jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
-    left, channels = phi.latent_size(scene, config.model)
+    network = decoder.of(garment, config.model)
 
     def of_code(latent):
-        return energy(decoder.displacement(garment, latent, free, config.model))
+        return energy(network.apply({"params": garment}, latent, phi.free(scene)))
 
     return descent.regularised_inverse(
-        descent.hessian(of_code, jnp.zeros(left * channels)), config.model.descent_damping
+        descent.hessian(of_code, jnp.zeros(network.latent)), config.model.descent_damping
     )
 
 

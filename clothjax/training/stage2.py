@@ -161,11 +161,16 @@ def vertex_metric(garment: dict, latents: np.ndarray, model: ModelConfig) -> Arr
     Args:
         latents: [N, L] codes over which the variance is taken.
     """
-    weights = jax.vmap(lambda z: decoder.blend_weights(garment, z, model))(jnp.asarray(latents))
+    weights = jax.vmap(_weights(garment, model))(jnp.asarray(latents))
     shapes = garment["blendshapes"].reshape(garment["blendshapes"].shape[0], -1)
     gram = shapes @ shapes.T
     spread = weights - jnp.mean(weights, axis=0, keepdims=True)
     return gram / jnp.mean(jnp.einsum("nk,kl,nl->n", spread, gram, spread))
+
+
+def _weights(garment: dict, model: ModelConfig) -> Callable[[Array], Array]:
+    """A function from a code [L] to blend-shape weights [K]."""
+    return partial(decoder.of(garment, model).apply, {"params": garment}, method="blend_weights")
 
 
 def rollout_loss(
@@ -188,14 +193,15 @@ def rollout_loss(
     stage, normalizers = config.stage2, state.normalizers
     targets = jax.vmap(lambda z: normalisation.normalise(normalizers.latent, z))(latents)
     poses = jax.vmap(lambda x: normalisation.normalise(normalizers.pose, x))(poses)
+    of_code, predictor = _weights(state.garment, config.model), psi.Psi(stage)
     noise = stage.noise * jax.random.normal(key, targets[0].shape)
 
     def weights(latent):
-        return decoder.blend_weights(state.garment, normalisation.denormalise(normalizers.latent, latent), config.model)
+        return of_code(normalisation.denormalise(normalizers.latent, latent))
 
     def body(latent, inputs):
         pose, target = inputs
-        predicted = psi.predict(params, latent, pose, constants, stage.latent_decay)
+        predicted = predictor.apply({"params": params}, latent, pose, constants)
         error = jnp.mean((predicted - target) ** 2)
         if stage.vertex_share > 0:
             apart = weights(predicted) - weights(target)

@@ -66,10 +66,10 @@ def write(path: Path, peer: Peer, *, int8: bool = False, whole: bool = True) -> 
     g, params = Graph(int8), peer.params
     if peer.network == "ncs":
         units = [params["unit"]]
-        locals_, joints = params["local"], params["dynamic"][0]["kernel"].shape[0] // baselines.LOCAL
-        given = {"static": (1, len(params["static"][0]["kernel"])), "dynamic": (joints, len(locals_[0]["kernel"]))}
+        locals_, joints = params["local"], params["dynamic"]["0"]["kernel"].shape[0] // baselines.LOCAL
+        given = {"static": (1, len(params["static"]["0"]["kernel"])), "dynamic": (joints, len(locals_["0"]["kernel"]))}
     else:
-        units = params["units"]
+        units = list(params["units"].values())
         given = {"inputs": (1, len(units[0]["input"]["kernel"]))}
     width = len(units[0]["state"]["kernel"])
     given["hidden"] = (1, len(units) * width)
@@ -124,16 +124,16 @@ def _by_coordinate(peer: Peer) -> Layer:
 
 def _ncs(g: Graph, params: Params, joints: int) -> str:
     static, dynamic = "static", "dynamic"
-    for layer in params["static"]:
+    for layer in params["static"].values():
         static = g("Relu", g.layer(static, Layer(**layer)))
-    for layer in params["local"]:
+    for layer in params["local"].values():
         dynamic = g("Relu", g.product(dynamic, layer["kernel"]))
     dynamic = g("Reshape", dynamic, np.array([1, joints * baselines.LOCAL], np.int64))
-    for layer in params["dynamic"]:
+    for layer in params["dynamic"].values():
         dynamic = g("Relu", g.product(dynamic, layer["kernel"]))
     memory = _gru(g, params["unit"], dynamic, "hidden", "next_hidden")
     code = g("Add", static, memory)
-    for layer in params["decoder"]:
+    for layer in params["decoder"].values():
         code = g("Relu", g.layer(code, Layer(**layer)))
     return code
 

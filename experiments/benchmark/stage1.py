@@ -8,19 +8,22 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax.experimental.compilation_cache import compilation_cache
 
 from clothjax.body.motion_clips import Clips
-from clothjax.config import Config
+from clothjax.config import Config, ModelConfig
 from clothjax.geometry import mesh_hierarchy
-from clothjax.networks import mesh_convolution, phi
-from clothjax.networks.mlp import Params
+from clothjax.networks import phi
+from clothjax.networks.graph_features import Features
+from clothjax.networks.mesh_convolution import MeshConvolution
+from clothjax.networks.message_passing import MessagePassing
 from clothjax.physics import incremental_potential, solver
 from clothjax.progress import progress_bar
 from clothjax.simulation import assembly
 from clothjax.simulation.assembly import Experiment
+from clothjax.simulation.scene import Scene
 from clothjax.training import loop, stage1
+from clothjax.types import Array
 from experiments.benchmark import textbook, timing
 from experiments.benchmark.timing import against_peaks, cost, interleaved, program, temporary_bytes
 
@@ -67,13 +70,11 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
 
     names = ("type_embedding", "level_embedding", "encoder", "processor")
     params = {name: state.params[name] for name in names}
-    forms = {"ours": phi.pass_messages, "textbook": textbook.process}
+    forms = {"ours": passed, "textbook": textbook.process}
     arguments = (params, state.statistics, moment.first.seen)
     kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
-    rounded = dataclasses.replace(recomputed, bfloat16=True)
     programs = {
         "ours": program(loss(forms["ours"], recomputed), *arguments),
-        "ours, products in bfloat16": program(loss(forms["ours"], rounded), *arguments),
         "ours, nothing recomputed": program(loss(forms["ours"], kept), *arguments),
         "textbook": program(loss(forms["textbook"], kept), *arguments),
     }
@@ -88,7 +89,6 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
         return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
 
     single = difference()
-    exact, low = (programs[name]()[1] for name in ("ours", "ours, products in bfloat16"))
     with jax.enable_x64(True):
         arguments = jax.tree.map(solver.to_float64, arguments)
         double = difference()
@@ -97,16 +97,14 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
         "processor_memory_ratio": memory["ours"] / memory["textbook"],
         "processor_error_float32": single,
         "processor_error_float64": double,
-        "bfloat16_speedup": seconds["ours"] / seconds["ours, products in bfloat16"],
-        "bfloat16_gradient_error": _apart(low, exact),
         "processor": {name: {"seconds": seconds[name], "temporary_mib": memory[name] / 2**20} for name in programs},
     }
 
 
-def _apart(one: Params, other: Params) -> float:
-    """The norm of the difference of two gradients, over that of the second."""
-    difference = optax.tree.norm(jax.tree.map(jnp.subtract, one, other))
-    return float(difference / optax.tree.norm(other))
+def passed(params: dict, statistics: dict, scene: Scene, seen: Features, model: ModelConfig) -> Array:
+    """Encode and Process: the garment's node latents [V, W] from features."""
+    one = MessagePassing(model, scene.graph, scene.level, scene.garment.pinned)
+    return one.apply({"params": params, "statistics": statistics}, seen)
 
 
 def convolution(experiment: Experiment, rounds: int) -> dict:
@@ -117,11 +115,12 @@ def convolution(experiment: Experiment, rounds: int) -> dict:
     table = mesh_hierarchy.hierarchy(experiment.garment.faces, count, [level.stride], [level.radius])[0]
     inputs, outputs = CONVOLUTION
     keys = jax.random.split(jax.random.key(0))
-    params = mesh_convolution.init(keys[0], table, inputs, outputs, config.model.convolution_bases, 0.0)
+    block = MeshConvolution(outputs, config.model.convolution_bases, 0.0)
     x = jax.random.normal(keys[1], (count, inputs))
+    params = block.init(keys[0], x, table)["params"]
 
     def ours(params, x):
-        return mesh_convolution.apply(params, x, table.ids, table.mask, residual_rate=0.0)
+        return block.apply({"params": params}, x, table)
 
     def explicit(params, x):
         return textbook.convolve(params, x, table.ids, table.mask)
@@ -214,13 +213,13 @@ def _pieces(experiment: Experiment, moment: Moment) -> dict:
         return found.step, found.seen.world
 
     def passing(params, seen):
-        return jnp.mean(phi.pass_messages(params, statistics, scene, seen, config.model) ** 2)
+        return jnp.mean(passed(params, statistics, scene, seen, config.model) ** 2)
 
     def convolving(params, processed):
-        return jnp.mean(phi.convolve(params, scene, processed, config.model) ** 2)
+        return jnp.mean(phi.Phi(config.model, scene).apply({"params": params}, processed, method="convolve") ** 2)
 
     def physics(params, latent, step):
-        new = phi.decode(params, scene, character, latent, window, config.model)
+        new = phi.decode(params["garment"], scene, character, latent, window, config.model)
         return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
     def descent(gradient, weights):

@@ -8,15 +8,20 @@ import jax
 import jax.numpy as jnp
 
 from clothjax.networks import normalisation
-from clothjax.networks.mlp import apply_mlp
+from clothjax.networks.mlp import MLP, Params
 from clothjax.types import Array
+
+
+def mlp(params: Params, x: Array) -> Array:
+    """The library's MLP of such parameters, with a LayerNorm, on [N, inputs]."""
+    kernels = [layer["kernel"] for name, layer in params.items() if name.startswith("dense")]
+    return MLP((x.shape[-1], *(kernel.shape[1] for kernel in kernels))).apply({"params": params}, x)
 
 
 def process(params, statistics, scene, seen, config) -> Array:
     """Node latents [V, W] of the garment: every message from concatenated rows, gathered, summed by `segment_sum`,
     block after block, with a body node for every slot and every pair in every block."""
     encoder = params["encoder"]
-    mlp = apply_mlp
     pinned = scene.garment.pinned.astype(jnp.int32)
     count = len(pinned)
 
@@ -39,7 +44,7 @@ def process(params, statistics, scene, seen, config) -> Array:
     graph["world"] = (jnp.concatenate([slot, vertex]), jnp.concatenate([vertex, slot]))
     pairs = jnp.concatenate([seen.world.to_garment, seen.world.to_body])
     edges["world"] = mlp(encoder["world"], normalisation.standardise(statistics["world"], pairs))
-    for stack, stacked in zip(config.processor, params["processor"]):
+    for stack, stacked in zip(config.processor, params["processor"].values()):
         active = seen.world.active & jnp.asarray(scene.level >= stack.lowest_level)
         keep = jnp.concatenate([active, active])[:, None]
         for index in range(stack.blocks):

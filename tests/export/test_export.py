@@ -11,7 +11,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from samples import apart, random_model
+from samples import ROOT, apart, random_model
 from toy import small
 
 from clothjax.body import skinning
@@ -179,7 +179,7 @@ def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
 def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
     subprocess.run(["npm", "install", "--silent", "onnxruntime-web"], check=True, cwd=tmp_path)
     for name in ("psi.mjs", "garment.mjs"):
-        shutil.copy(Path(convert.__file__).parent / "deploy" / name, tmp_path)
+        shutil.copy(ROOT / "experiments" / "deploy" / name, tmp_path)
     motion = convert.validation(model)
     rotations = np.asarray(motion.rotations).reshape(len(motion.rotations), -1)
     given = {"rotations": rotations.tolist(), "translation": motion.translation.tolist()}
@@ -205,7 +205,7 @@ def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
     got = subprocess.run(["go", "mod", "download", "-json", module], check=True, capture_output=True, text=True)
     (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
     (tmp_path / "libonnxruntime.so.1").symlink_to(library)
-    source = Path(convert.__file__).parent / "deploy" / "play_onnx.c"
+    source = ROOT / "experiments" / "deploy" / "play_onnx.c"
     command = [native.compiler(), "-std=c99", "-O2", "-Wall", "-Werror", "-isystem", json.loads(got.stdout)["Dir"]]
     program = tmp_path / "play_onnx"
     command += [source, tmp_path / "libonnxruntime.so.1", f"-Wl,-rpath,{tmp_path}", "-o", program]
@@ -230,7 +230,7 @@ def test_litert_agrees_over_300_frames(model, tmp_path):
     """In an environment of its own, as its module says: TensorFlow wants older packages."""
     venv.create(tmp_path / "tf", with_pip=True)
     python = tmp_path / "tf" / "bin" / "python"
-    root = Path(convert.__file__).parents[2]
+    root = ROOT
     packages = (f"{root}[export]", "tensorflow-cpu", "ai-edge-litert")
     subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
     for int8, most in (((), 0.1), (("--int8",), 2.0)):
@@ -247,11 +247,14 @@ def test_stablehlo_runs_without_clothjax(model, motion, tmp_path):
     assert apart(stablehlo.run_stablehlo(path, model, motion), model, motion).max() < 2e-5
 
 
-def test_safetensors_hold_the_whole_model(model, motion, tmp_path):
+def test_safetensors_hold_the_whole_model(model, motion, tmp_path, monkeypatch):
     for each in (model, specialise.specialise(model, blendshapes=50)):
         path = safetensors.to_safetensors(each, tmp_path / "g.safetensors")
         again = safetensors.from_safetensors(path)
         np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(each, motion)[0])
+    with monkeypatch.context() as older, pytest.raises(ValueError, match=r"has format 1, .* reads up to 0; update it"):
+        older.setattr(safetensors, "FORMAT", 0)
+        safetensors.from_safetensors(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"g\.safetensors: not a whole model in safetensors .*convert it again"):
         safetensors.from_safetensors(path)

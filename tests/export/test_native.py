@@ -4,13 +4,12 @@ import dataclasses
 import os
 import shutil
 import subprocess
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from samples import apart, random_model
+from samples import ROOT, apart, random_model
 
 import clothjax as cj
 from clothjax.commands import convert
@@ -19,7 +18,7 @@ from clothjax.runtime import inference, specialise
 from clothjax.types import Pose
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
-PLAY = Path(convert.__file__).parent / "deploy" / "play.c"
+PLAY = ROOT / "experiments" / "deploy" / "play.c"
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 

@@ -69,11 +69,11 @@ def test_edges_are_sorted_unique_and_those_of_the_faces():
 
 def test_directed_edges_hold_both_directions_sorted_by_receiver():
     edges = topology.edges(sheet(4, 3))
-    graph = topology.directed(np.random.default_rng(2).permutation(edges))
-    pairs = list(zip(graph.receivers.tolist(), graph.senders.tolist()))
+    senders, receivers = topology.directed(np.random.default_rng(2).permutation(edges))
+    pairs = list(zip(receivers.tolist(), senders.tolist()))
     assert pairs == sorted({(a, b) for a, b in edges.tolist()} | {(b, a) for a, b in edges.tolist()})
-    assert graph.senders.dtype == graph.receivers.dtype == np.int32
-    assert topology.directed(np.zeros((0, 2), int)).senders.shape == (0,)
+    assert senders.dtype == receivers.dtype == np.int32
+    assert topology.directed(np.zeros((0, 2), int))[0].shape == (0,)
 
 
 def test_components_are_numbered_by_their_lowest_vertices():

@@ -86,9 +86,10 @@ def test_only_the_dynamic_inputs_know_of_earlier_frames(chain):
 
 
 def test_the_unit_is_flaxs():
-    params = baselines._init_gru(jax.random.key(0), 5, 4, bias=True)
-    params["input"]["bias"] = jax.random.normal(jax.random.key(1), (12,))
+    unit = baselines.GRU(4)
     rows = jax.random.normal(jax.random.key(2), (6, 5))
+    params = unit.init(jax.random.key(0), jnp.zeros(4), rows[0])["params"]
+    params["input"]["bias"] = jax.random.normal(jax.random.key(1), (12,))
     cell = nn.GRUCell(4)
     names = ("z", "r", "n")
     theirs = {
@@ -100,7 +101,7 @@ def test_the_unit_is_flaxs():
     theirs["hn"]["bias"] = jnp.zeros(4)
     one = other = jnp.zeros(4)
     for row in rows:
-        one = baselines._gru(params, one, row)
+        one = unit.apply({"params": params}, one, row)
         other, _ = cell.apply({"params": theirs}, other, row)
     np.testing.assert_allclose(one, other, atol=1e-6)
     assert np.abs(one).max() > 0.1
@@ -110,9 +111,10 @@ def test_the_dynamic_code_is_zero_while_nothing_moves():
     config = settings("ncs")
     params = baselines.init(jax.random.key(0), 2, 3, jnp.zeros((1, 7, 3)), config)
     static = jnp.ones(21)
-    _, memory = baselines._ncs(params, jnp.zeros(8), static, jnp.zeros((2, 12)))
+    network = baselines.network(config, 7)
+    _, memory = network.apply({"params": params}, jnp.zeros(8), static, jnp.zeros((2, 12)))
     assert not np.any(memory)
-    _, memory = baselines._ncs(params, jnp.zeros(8), static, jnp.ones((2, 12)))
+    _, memory = network.apply({"params": params}, jnp.zeros(8), static, jnp.ones((2, 12)))
     assert np.any(memory)
 
 
@@ -126,10 +128,9 @@ def test_facing_and_place_are_not_seen(built):
 
     @jax.jit
     def run(poses):
-        return baselines.displacement(
-            state.params, memory, poses, jnp.asarray(whole.body.joints), constants, whole.scene.body.parents, kept,
-            config,
-        )  # fmt: skip
+        joints, parents = jnp.asarray(whole.body.joints), whole.scene.body.parents
+        seen = baselines.inputs(poses, joints, constants, parents, kept, config)
+        return baselines.network(config, len(whole.garment.vertices)).apply({"params": state.params}, memory, **seen)
 
     root = int(kept[0])
     turn = jnp.asarray(about_y(1.0), jnp.float32)

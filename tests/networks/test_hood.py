@@ -2,15 +2,17 @@
 
 from pathlib import Path
 
+import hood_oracle as hood
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hood_oracle import Cloth, State
 
 from clothjax.geometry import mesh_hierarchy, topology
-from clothjax.networks import hood, message_passing
-from clothjax.networks.hood import Cloth, State
-from clothjax.networks.mlp import _affine, mlp_tail
+from clothjax.networks.message_passing import Block, Latents, reached
+from clothjax.networks.mlp import _affine
+from clothjax.simulation.scene import edge_set
 
 DATA = Path(__file__).parents[1] / "data" / "hood_rollout.npz"  # of golden_hood_model_small.npz: a grid over a sphere
 PREFIX = "_learned_model."
@@ -74,10 +76,12 @@ def ours(torch: dict[str, np.ndarray]) -> dict:
         "type_embedding": torch["nodetype_embedding.weight"],
         "level_embedding": torch["vertexlevel_embedding.weight"],
         "encoder": encoder,
-        "processor": [
-            jax.tree.map(lambda *parts: np.stack(parts), *(block(level, i, stack) for i in range(stack.blocks)))
+        "processor": {
+            str(level): jax.tree.map(
+                lambda *parts: np.stack(parts), *(block(level, i, stack) for i in range(stack.blocks))
+            )
             for level, stack in enumerate(hood.SCHEDULE)
-        ],
+        },
         "decoder": layers(PREFIX + "decoder."),
     }
 
@@ -85,8 +89,8 @@ def ours(torch: dict[str, np.ndarray]) -> dict:
 def cloth(golden) -> Cloth:
     faces, count = golden["faces"], len(golden["rest_pos"])
     levels = mesh_hierarchy.coarse_levels(faces, 3, centre=int(golden["center"]))
-    graph = {"mesh": topology.directed(topology.edges(faces))}
-    graph |= {f"coarse{i}": topology.directed(level) for i, level in enumerate(levels)}
+    graph = {"mesh": edge_set(topology.edges(faces), count)}
+    graph |= {f"coarse{i}": edge_set(level, count) for i, level in enumerate(levels)}
     rest = golden["rest_pos"]
     area = 0.5 * np.linalg.norm(
         np.cross(rest[faces[:, 1]] - rest[faces[:, 0]], rest[faces[:, 2]] - rest[faces[:, 0]]), axis=1
@@ -186,19 +190,20 @@ def test_every_block_is_hoods(golden, shared):
     edges |= {f"coarse{i}": rows(f"roll2_enc_c{i}", f"coarse{i}") for i in (0, 1)}
     pair_latents = {"to_body": world("roll2_enc_c2o"), "to_garment": world("roll2_enc_o2c")}
     done = 0
-    for stack, stacked, least in zip(hood.SCHEDULE, params["processor"], (0, 1, 2, 1, 0)):
-        rows, graph = message_passing._reached(stack, garment.graph, garment.level)
-        np.testing.assert_array_equal(np.arange(count)[rows], np.flatnonzero(garment.level >= least))
+    for stack, stacked, least in zip(hood.SCHEDULE, params["processor"].values(), (0, 1, 2, 1, 0)):
+        rows, graphs = reached(stack, garment.graph, garment.level)
+        here = slice(None) if rows is None else rows
+        np.testing.assert_array_equal(np.arange(count)[here], np.flatnonzero(garment.level >= least))
+        one = Block(16, 3, graphs, rows)
         for index in range(stack.blocks):
             p = jax.tree.map(lambda x, index=index: x[index], stacked)
-            nodes, body, updated, near = message_passing._block(
-                p, nodes, body, {name: edges[name] for name in stack.edges},
-                {name: latents[rows] for name, latents in pair_latents.items()},
-                rows, graph, jnp.asarray(slots[rows]), jnp.asarray(active[rows]),
-                mlp_tail,
-            )  # fmt: skip
+            near = {name: latents[here] for name, latents in pair_latents.items()}
+            latents = Latents(nodes, body, {name: edges[name] for name in stack.edges}, near)
+            (nodes, body, updated, near), _ = one.apply(
+                {"params": p}, latents, jnp.asarray(slots[here]), jnp.asarray(active[here])
+            )
             edges |= updated
-            pair_latents = {name: pair_latents[name].at[rows].set(latents) for name, latents in near.items()}
+            pair_latents = {name: pair_latents[name].at[here].set(latents) for name, latents in near.items()}
             np.testing.assert_allclose(nodes, full[f"roll2_step{done:02d}_cloth"], rtol=0, atol=1e-10)
             touched = np.unique(pairs[1])
             np.testing.assert_allclose(body[touched], full[f"roll2_step{done:02d}_obst"][touched], rtol=0, atol=1e-10)

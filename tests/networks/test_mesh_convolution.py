@@ -9,6 +9,8 @@ import pytest
 
 from clothjax.geometry import mesh_hierarchy
 from clothjax.networks import mesh_convolution
+from clothjax.networks.mesh_convolution import MeshConvolution
+from clothjax.simulation.scene import Table
 
 DATA = Path(__file__).parents[1] / "data" / "mesh_convolution.npz"  # layers 2, 3 and 4 of the golden chain
 GOLDEN = Path(__file__).parents[3] / "shared" / "golden" / "golden_meshconv.npz"
@@ -61,8 +63,9 @@ def test_values_and_gradients_equal_the_golden_layers(layer, basis_first, monkey
 
         def block(params, x):
             rate, activation = float(golden["rate"]), jax.nn.elu if layer < 6 else lambda y: y
-            mask = ids < golden["meta"][2]
-            return mesh_convolution.apply(params, x, ids, mask, residual_rate=rate, activation=activation)
+            bases = params["basis"].shape[1] if "basis" in params else 0
+            one = MeshConvolution(golden["out"].shape[-1], bases, rate, activation)
+            return one.apply({"params": params}, x, Table(ids, ids < golden["meta"][2]))
 
         @jax.jit
         def evaluate(params, x, cotangent):
@@ -95,7 +98,7 @@ def test_padding_has_no_effect_and_no_gradient():
 
     @jax.jit
     def loss(params):
-        return (mesh_convolution.apply(params, x, level.ids, level.mask) ** 2).sum()
+        return (MeshConvolution(7, 3).apply({"params": params}, x, level) ** 2).sum()
 
     quiet = loss(params)
     params["coefficients"][padding] = params["density"][padding] = 1e6
@@ -112,7 +115,7 @@ def test_pooling_is_a_weighted_mean_whatever_the_sign_of_the_density():
 
     @jax.jit
     def pool(x):
-        return mesh_convolution.apply({"density": density}, x, level.ids, level.mask, residual_rate=1.0)
+        return MeshConvolution(4, 3, 1.0).apply({"params": {"density": density}}, x, level)
 
     np.testing.assert_allclose(pool(np.full_like(x, 2.5)), 2.5, rtol=1e-5)
     weights = [np.abs(row[mask]) for row, mask in zip(density, level.mask)]
@@ -138,10 +141,11 @@ def test_parameters_are_only_those_that_rate_and_shapes_call_for(stride, out, ra
 
     @jax.jit
     def born(key):
-        params = mesh_convolution.init(key, level, 4, out, 3, rate)
+        block = MeshConvolution(out, 3, rate)
+        params = block.init(key, x, level).get("params", {})
 
         def loss(params):
-            y = mesh_convolution.apply(params, x, level.ids, level.mask, residual_rate=rate)
+            y = block.apply({"params": params}, x, level)
             return (y**2).sum(), y
 
         return jax.grad(loss, has_aux=True)(params)
@@ -154,7 +158,7 @@ def test_parameters_are_only_those_that_rate_and_shapes_call_for(stride, out, ra
 
 def test_rates_outside_zero_to_one_are_refused():
     with pytest.raises(ValueError, match=r"residual_rate is 1\.5"):
-        mesh_convolution.init(jax.random.key(0), table(), 4, 4, 3, 1.5)
+        MeshConvolution(4, 3, 1.5).init(jax.random.key(0), normal(72, 4), table())
 
 
 def test_a_new_stack_keeps_the_size_of_smooth_features():
@@ -167,8 +171,7 @@ def test_a_new_stack_keeps_the_size_of_smooth_features():
         measured = []
         for index, (level, out) in enumerate(zip(levels, (96, 128, 64))):
             key = jax.random.fold_in(key, index)
-            params = mesh_convolution.init(key, level, x.shape[1], out, 8)
-            x = mesh_convolution.apply(params, x, level.ids, level.mask)
+            x, _ = MeshConvolution(out, 8).init_with_output(key, x, level)
             measured.append((x**2).mean())
         return jnp.stack(measured)
 

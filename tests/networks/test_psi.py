@@ -9,6 +9,7 @@ from toy import small
 from clothjax.body import motion_clips, skinning
 from clothjax.config import Config, MaterialConfig
 from clothjax.networks import decoder, normalisation, psi
+from clothjax.networks.psi import Psi
 from clothjax.simulation import assembly
 from clothjax.training import stage2
 from clothjax.training.stage2 import Teacher
@@ -84,13 +85,14 @@ def _config(**stage) -> Config:
     config = Config()
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, decoder=(8,)),
+        model=dataclasses.replace(config.model, decoder=(8,), blendshapes=5),
         stage2=dataclasses.replace(config.stage2, **stage),
     )
 
 
-def _garment(config, size=6, shapes=5, vertices=7):
-    basis = np.random.default_rng(1).normal(size=(shapes, vertices, 3)).astype(np.float32)
+def _garment(config, size=6, vertices=7):
+    shape = (config.model.blendshapes, vertices, 3)
+    basis = np.random.default_rng(1).normal(size=shape).astype(np.float32)
     return decoder.init(jax.random.key(2), size, basis, config.model)
 
 
@@ -100,14 +102,15 @@ def test_a_share_of_the_loss_is_the_vertex_error_over_the_vertices_variance(shar
     config = _config(vertex_share=share, noise=0.0, rollout=1, hidden=(8,))
     garment = _garment(config)
     state = stage2.init(teacher, garment, config)
-    decode = jax.vmap(lambda z: decoder.displacement(garment, z, jnp.ones(7), config.model))
+    network = decoder.of(garment, config.model)
+    decode = jax.vmap(lambda z: network.apply({"params": garment}, z, jnp.ones(7)))
     codes = jnp.asarray(teacher.latents[0, :2])
     value = stage2.rollout_loss(
         state.params, state, codes, jnp.asarray(teacher.poses[0, :1]), jnp.zeros(3), jax.random.key(0), config
     )
     normal = [normalisation.normalise(state.normalizers.latent, z) for z in codes]
     pose = normalisation.normalise(state.normalizers.pose, jnp.asarray(teacher.poses[0, 0]))
-    predicted = psi.predict(state.params, normal[0], pose, jnp.zeros(3), 0.1)
+    predicted = Psi(config.stage2).apply({"params": state.params}, normal[0], pose, jnp.zeros(3))
     every = decode(jnp.asarray(teacher.latents[:, 1:].reshape(-1, 6)))
     pair = decode(jnp.stack([normalisation.denormalise(state.normalizers.latent, predicted), codes[1]]))
     vertex = jnp.mean((pair[0] - pair[1]) ** 2) / jnp.mean((every - every.mean(0, keepdims=True)) ** 2)
@@ -149,10 +152,11 @@ def test_motions_of_training_are_ordinary_though_the_teacher_did_not_play_them()
 
 
 def test_a_code_that_the_network_does_not_hold_is_forgotten():
-    params = psi.init(jax.random.key(0), 6, 4, 3, _config(hidden=(8,)).stage2)
+    stage = _config(hidden=(8,)).stage2
+    params = psi.init(jax.random.key(0), 6, 4, 3, stage)
     silent = jax.tree.map(jnp.zeros_like, params)
     code = jnp.arange(6.0)
-    kept = psi.predict(silent, code, jnp.ones(4), jnp.ones(3), 0.1)
+    kept = Psi(stage).apply({"params": silent}, code, jnp.ones(4), jnp.ones(3))
     np.testing.assert_allclose(kept, 0.9 * code, rtol=1e-6)
 
 
@@ -165,7 +169,8 @@ def test_trained_with_noise_it_follows_its_teacher_in_closed_loop():
     normalizers = state.normalizers
 
     def follow(latent, pose):
-        latent = psi.predict(state.params, latent, normalisation.normalise(normalizers.pose, pose), jnp.zeros(3), 0.1)
+        pose = normalisation.normalise(normalizers.pose, pose)
+        latent = Psi(config.stage2).apply({"params": state.params}, latent, pose, jnp.zeros(3))
         return latent, normalisation.denormalise(normalizers.latent, latent)
 
     start = normalisation.normalise(normalizers.latent, jnp.asarray(unseen.latents[0, 0]))

@@ -6,17 +6,20 @@ It predicts an acceleration of every vertex where Phi predicts a code; there is 
 
 from typing import NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import jraph
+import numpy as np
 
 from clothjax.body import skinning
 from clothjax.config import Stack
 from clothjax.geometry import proximity
-from clothjax.networks import graph_features, message_passing, normalisation
-from clothjax.networks.message_passing import World
-from clothjax.networks.mlp import Params, apply_mlp, init_mlp
+from clothjax.networks import graph_features, normalisation
+from clothjax.networks.message_passing import Encoder, Processor, World
+from clothjax.networks.mlp import MLP, Params
 from clothjax.networks.normalisation import Statistics
-from clothjax.types import Array, EdgeSet
+from clothjax.types import Array
 
 NORMAL, BODY, OMITTED, PINNED = range(4)  # rows of the type embedding; the others are not used
 TYPES, LEVELS = (9, 9), (4, 4)  # rows and columns of the embeddings
@@ -41,7 +44,7 @@ class Cloth(NamedTuple):
     mass: Array  # [V] kg
     materials: Array  # [3] bending, mu and lambda, scaled to [0, 1]
     pinned: Array  # [V] bool
-    graph: dict[str, EdgeSet]  # `mesh`, `coarse0`, `coarse1`, and `coarse2`, which only the statistics see
+    graph: dict[str, jraph.GraphsTuple]  # `mesh`, `coarse0`, `coarse1`, and `coarse2`, which only the statistics see
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     body_faces: Array  # [Fb, 3] int32
     omitted: Array  # [B] bool, body vertices that touch nothing: hands
@@ -65,20 +68,35 @@ class Step(NamedTuple):
     vertices: Array  # [V] int32, of the body
 
 
-def init(key: Array, width: int = 128) -> Params:
-    """Parameters of the published sizes, but for the encoder of `coarse2`, which nothing would read."""
-    keys = jax.random.split(key, 7)
-    hidden = (width,) * 3
-    encoder = {"nodes": init_mlp(keys[0], (NODE, *hidden)), "world": init_mlp(keys[1], (WORLD, *hidden))}
-    for index, name in enumerate(("mesh", "coarse0", "coarse1")):
-        encoder[name] = init_mlp(jax.random.fold_in(keys[2], index), (EDGE, *hidden))
-    return {
-        "type_embedding": jax.random.normal(keys[3], TYPES),
-        "level_embedding": jax.random.normal(keys[4], LEVELS),
-        "encoder": encoder,
-        "processor": message_passing.init_processor(keys[5], SCHEDULE, width, 3),
-        "decoder": init_mlp(keys[6], (width, width, width, 3), norm=False),
-    }
+class Network(nn.Module):
+    """HOOD's encoders, message passing and decoder, at the published sizes.
+
+    Not there is the encoder of `coarse2`, which nothing would read.
+    """
+
+    level: np.ndarray
+    width: int = 128
+
+    def setup(self):
+        self.type_embedding = self.param("type_embedding", nn.initializers.normal(1.0), TYPES)
+        self.level_embedding = self.param("level_embedding", nn.initializers.normal(1.0), LEVELS)
+        self.encoder = Encoder(self.width, 3)
+        self.processor = Processor(SCHEDULE, self.width, 3, self.level)
+        self.decoder = MLP((self.width, self.width, self.width, 3), norm=False)
+
+    def embed(self, kinds: Array, levels: Array) -> list[Array]:
+        """Embeddings [N, 9] and [N, 4] of node types [N] and levels [N]."""
+        return [self.type_embedding[kinds], self.level_embedding[levels]]
+
+    def __call__(self, nodes: Array, edges: dict[str, Array], world: Array, slots, active, graph) -> Array:
+        """The output [V, 3] of normalised features of nodes, edges and pairs, those of the garment before the body's
+        and those towards the body before those towards the garment."""
+        count = len(self.level)
+        rows = self.encoder({"nodes": nodes, "world": world, **edges})
+        nodes, world = rows["nodes"], rows["world"]
+        graphs = {name: graph[name]._replace(edges=rows[name]) for name in edges}
+        pairs = {"to_body": world[:count], "to_garment": world[count:]}
+        return self.decoder(self.processor(nodes[:count], graphs, World(nodes[count:], slots, active, pairs)))
 
 
 def init_statistics() -> dict[str, Statistics]:
@@ -106,6 +124,7 @@ def step(
         timestep: s.
         training: collect statistics; otherwise they are only used.
     """
+    network = Network(cloth.level, params["decoder"]["dense_0"]["bias"].shape[0])
     fixed = cloth.pinned[:, None]
     previous, position = jnp.where(fixed, state.position, state.previous), jnp.where(fixed, target, state.position)
     before, now, following = bodies
@@ -128,7 +147,7 @@ def step(
 
     def node(velocity, kinds, levels, normal, log_mass, materials):
         dt = jnp.broadcast_to(jnp.reshape(timestep, (1, 1)), (count, 1))
-        embedded = [params["type_embedding"][kinds], params["level_embedding"][levels]]
+        embedded = network.apply({"params": params}, kinds, levels, method="embed")
         return jnp.concatenate([velocity, *embedded, normal, dt, log_mass[:, None], materials], axis=-1)
 
     ones = jnp.ones_like(position[:, :1])
@@ -154,28 +173,16 @@ def step(
     level_frame = jnp.eye(3, dtype=position.dtype)
     edges = {}
     for name in ("mesh", "coarse0", "coarse1", "coarse2"):  # in this order, which the statistics see
-        senders, receivers = cloth.graph[name]
+        graph = cloth.graph[name]
         rows = graph_features.mesh_edges(
-            senders, receivers, {"now": position}, cloth.rest, level_frame, timestep, cloth.materials
+            graph.senders, graph.receivers, {"now": position}, cloth.rest, level_frame, timestep, cloth.materials
         )
         edges[name] = normalised("mesh", rows)
     del edges["coarse2"]
     to_body, to_garment = graph_features.world_edges(offset, position - following[index], level_frame, timestep)
     world = normalised("world", jnp.concatenate([to_body, to_garment]), jnp.concatenate([active, active]))
 
-    encoder = params["encoder"]
-    nodes, world = apply_mlp(encoder["nodes"], nodes), apply_mlp(encoder["world"], world)
-    processed = message_passing.process(
-        params["processor"],
-        SCHEDULE,
-        nodes[:count],
-        {name: apply_mlp(encoder[name], rows) for name, rows in edges.items()},
-        World(nodes[count:], slots, active, {"to_body": world[:count], "to_garment": world[count:]}),
-        cloth.graph,
-        cloth.level,
-        remat=False,
-    )
-    output = apply_mlp(params["decoder"], processed)
+    output = network.apply({"params": params}, nodes, edges, world, slots, active, cloth.graph)
     scale = used["output"]
     acceleration = output * jnp.sqrt(jnp.maximum(scale.variance, LEAST**2))[None] + scale.mean[None]
     if training:
