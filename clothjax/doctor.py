@@ -1,4 +1,9 @@
-"""Looks at an installation: versions, devices, assets, and which optional parts are there."""
+"""Looks at an installation: versions, devices, assets, and which optional parts are there.
+
+    python -m clothjax doctor
+
+It names what is missing for which command, and ends with 1 where clothjax cannot run.
+"""
 
 import platform
 import re
@@ -7,10 +12,12 @@ from importlib import metadata
 
 from packaging.requirements import Requirement
 
+from clothjax import cli
+
 COMMANDS = {
     "data": "data_prep.anny: makes the embedded body anew",
-    "export": "experiments.convert, experiments.benchmark, experiments.thesis: ONNX, safetensors",
-    "render": "experiments.render, gallery, quickstart, benchmark, stability, thesis: pictures, glTF, USD, video",
+    "export": "clothjax convert, experiments.benchmark, experiments.thesis: ONNX, safetensors",
+    "render": "clothjax render, experiments.gallery, quickstart, benchmark, stability, thesis: pictures, video",
     "sweep": "experiments.sweep: several trainings at once",
     "demo": "experiments.demo: the live page",
     "docs": "make docs: the reference of the library",
@@ -23,6 +30,13 @@ PROGRAMS = {  # by what they are: their names, and what needs them
     "Node.js": (("npm",), "experiments.web, and its tests"),
     "Chromium": (("chromium", "google-chrome"), "the tests of the demo and of the web page"),
 }
+
+
+def main(argv: list[str]) -> None:
+    cli.Parser("clothjax doctor", __doc__).parse_args(argv)
+    lines, sound = report()
+    print("\n".join(lines))
+    raise SystemExit(0 if sound else 1)
 
 
 def report() -> tuple[list[str], bool]:
@@ -93,7 +107,7 @@ def _devices() -> tuple[str, bool]:
 
 
 def _garments() -> tuple[list[str], bool]:
-    """Whether the garments that come with the library can be read."""
+    """Lines about the garments that come with the library, and whether they can be read."""
     from clothjax.runtime import trained
 
     lines, sound = [], True

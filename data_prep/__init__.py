@@ -1,1 +1,1 @@
-"""Programs that make bodies, garments and motions in clothjax's schema; the library imports none of them."""
+"""Programs that make bodies, garments and motions as files of clothjax; the library imports none of them."""

@@ -1,9 +1,9 @@
-"""Motion of AMASS (SMPL-H and SMPL-X layouts), carried over to any body with CMU's or SMPL's joint names.
+"""Motions of AMASS (SMPL-H and SMPL-X layouts), for any body with CMU's or SMPL's joint names.
 
     python -m data_prep.amass 01_01_poses.npz out.h5 --body body.h5 --fps 30
 
-SMPL's poses are relative to a T-pose, so no skeleton of who was recorded is needed. Hands and toes stay still. The
-files are up in z; of others, say so with --up y.
+SMPL's poses are relative to a T-pose, so the skeleton of the recorded person is not needed. Hands and toes stay still.
+The files have z up; for others give --up y.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 
 
 def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
-    """The recording in a file, +Y up, its joints named as CMU's; without a skeleton: its offsets are zero.
+    """Read a recording with +Y up and CMU's joint names; it has no skeleton, so its offsets are zero.
 
     Raises:
         ValueError: naming the file, the array and the first wrong entry.

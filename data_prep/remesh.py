@@ -13,13 +13,16 @@ from data_prep.mesh import compact, edge_table
 def remesh(
     vertices: np.ndarray, faces: np.ndarray, length: float, iterations: int = 6
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh of the same surface and boundary whose edges are all about `length` metres long.
+    """Remesh a surface and its boundary with edges of about one length.
 
     Args:
         vertices: [V, 3] m.
         faces: [F, 3], manifold.
-        length: wanted, in metres.
-        iterations: of the four passes.
+        length: of the new edges, m.
+        iterations: repetitions of the four passes.
+
+    Returns:
+        New vertices [W, 3] m and faces [G, 3].
     """
     surface, triangles = vertices.copy(), faces.copy()
     edges, _, count = edge_table(triangles)
@@ -43,7 +46,7 @@ def remesh(
 
 
 def resample(vertices: np.ndarray, faces: np.ndarray, wanted: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """The surface remeshed to about so many vertices (3 %), and the length of its edges in m."""
+    """Remesh a surface to the `wanted` number of vertices within 3 %; return it and the length of its edges in m."""
     # equilateral triangles: two faces of sqrt(3)/4 h^2 for each vertex
     length = np.sqrt(igl.doublearea(vertices, faces).sum() / wanted / np.sqrt(3))
     shape, triangles = remesh(vertices, faces, length, 6)
@@ -56,7 +59,7 @@ def resample(vertices: np.ndarray, faces: np.ndarray, wanted: int) -> tuple[np.n
 
 
 def split(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Halves every edge longer than `longest`, cutting each face in two, three or four."""
+    """Halve every edge longer than `longest` [m], cutting each face in two, three or four."""
     edges, of_face, _ = edge_table(faces)
     long = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > longest
     middle = np.full(len(edges), -1)
@@ -83,12 +86,12 @@ def split(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.n
 def collapse(
     vertices: np.ndarray, faces: np.ndarray, shortest: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Collapses edges shorter than `shortest`, shortest first, never two that touch in one pass.
+    """Collapse edges shorter than `shortest` [m], shortest first, never two that touch in one pass.
 
-    An edge stays where its collapse would change the topology, stretch one beyond `longest`, or turn a face.
+    An edge stays if its collapse would change the topology, stretch an edge beyond `longest`, or turn a face.
 
     Returns:
-        vertices, faces, and how many edges were collapsed.
+        Vertices, faces, and the number of collapsed edges.
     """
     edges, _, count = edge_table(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -117,8 +120,8 @@ def collapse(
         ring = list((near_a | near_b) - {a, b})
         if np.sum((vertices[ring] - place) ** 2, axis=1).max() > longest**2:
             continue
-        kept = [triangles[i] for i in set(fans[a]) | set(fans[b]) if not {a, b} <= set(triangles[i])]
-        if _turns(vertices, np.array(kept).reshape(-1, 3), (a, b), place):
+        remaining = [triangles[i] for i in set(fans[a]) | set(fans[b]) if not {a, b} <= set(triangles[i])]
+        if _turns(vertices, np.array(remaining).reshape(-1, 3), (a, b), place):
             continue
         vertices[a] = place
         target[b] = a
@@ -130,7 +133,11 @@ def collapse(
 
 
 def flip(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    """Flips edges where that brings valences closer to six (four on the boundary) and folds nothing."""
+    """Flip edges if that brings valences closer to six (four on the boundary) and folds nothing.
+
+    Returns:
+        Faces [F, 3], and the number of flipped edges.
+    """
     edges, of_face, count = edge_table(faces)
     size = len(vertices)
     valence = np.bincount(edges.ravel(), minlength=size)
@@ -166,7 +173,7 @@ def flip(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def relax(vertices: np.ndarray, faces: np.ndarray, iterations: int = 3) -> np.ndarray:
-    """Moves vertices within the surface towards the area-weighted mean of their neighbours."""
+    """Move vertices within the surface towards the area-weighted mean of their neighbours."""
     edges, _, count = edge_table(faces)
     size, border = len(vertices), edges[count == 1]
     outer = boundary_mask(faces, size)
@@ -187,6 +194,7 @@ def relax(vertices: np.ndarray, faces: np.ndarray, iterations: int = 3) -> np.nd
 
 
 def _fans(faces: np.ndarray, count: int) -> list[list[int]]:
+    """Return for each of `count` vertices the indices of its faces."""
     fans: list[list[int]] = [[] for _ in range(count)]
     for i, face in enumerate(faces.tolist()):
         for v in face:
@@ -195,7 +203,7 @@ def _fans(faces: np.ndarray, count: int) -> list[list[int]]:
 
 
 def _turns(vertices: np.ndarray, faces: np.ndarray, moved: tuple[int, int], place: np.ndarray) -> bool:
-    """Whether a face would turn by more than 72 degrees if the moved vertices went to one place."""
+    """Return True if a face would turn by more than 72 degrees when the moved vertices meet at one place."""
     old = vertices[faces]
     new = np.where(np.isin(faces, moved)[..., None], place, old)
     before = np.cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
@@ -205,7 +213,7 @@ def _turns(vertices: np.ndarray, faces: np.ndarray, moved: tuple[int, int], plac
 
 
 def _folds(vertices: np.ndarray, s: int, t: int, p: int, q: int) -> bool:
-    """Whether the faces (s, q, p) and (t, p, q) lean from the plane of the pair by more than 53 degrees."""
+    """Return True if face (s, q, p) or (t, p, q) leans by more than 53 degrees from the plane of both."""
     x = vertices
     plane = np.cross(x[t] - x[s], x[p] - x[s]) + np.cross(x[s] - x[t], x[q] - x[t])
     new = np.stack([np.cross(x[q] - x[s], x[p] - x[s]), np.cross(x[p] - x[t], x[q] - x[t])])
@@ -214,6 +222,7 @@ def _folds(vertices: np.ndarray, s: int, t: int, p: int, q: int) -> bool:
 
 
 def _onto_segments(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Project points [n, 3] onto the nearest of the segments [m, 3]."""
     along = end - start
     share = ((points[:, None] - start) * along).sum(axis=-1) / (along**2).sum(axis=-1)
     nearest = start + np.clip(share, 0, 1)[..., None] * along

@@ -1,7 +1,7 @@
-"""Motion of one skeleton carried over to a body with other bones and another canonical pose.
+"""Retargeting of a motion to a body with other bones and another canonical pose.
 
-World rotations of the joints are copied by name. Bones of arms and legs are first aligned with the source's
-rest pose, so that an A-pose and a T-pose agree; the root's path is scaled by the length of a leg.
+World rotations of the joints are copied by name. Bones of arms and legs are first aligned with the source's rest pose,
+so that an A-pose and a T-pose agree. The root's path is scaled by the length of a leg.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ FROZEN = ("Hand", "Finger", "Thumb", "Toe")
 class Capture(NamedTuple):
     """A recorded motion of a skeleton in any unit of length."""
 
-    names: tuple[str, ...]  # CMU's, where the joint has a counterpart there
+    names: tuple[str, ...]  # CMU's for joints that CMU has
     parents: np.ndarray  # [n] root first with -1, parents before children
     offsets: np.ndarray  # [n, 3] from the parent, in the rest pose
     rotations: np.ndarray  # [T, n, 3, 3] local to the parent, identity in the rest pose
@@ -56,7 +56,7 @@ class Capture(NamedTuple):
 
 
 def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Joint names with SMPL's replaced by CMU's."""
+    """Return joint names with SMPL's replaced by CMU's."""
     return tuple(CMU_FROM_SMPL.get(n, n) for n in names)
 
 
@@ -70,14 +70,14 @@ def retarget(
     drop_clavicles: float = 0.0,
     freeze: bool = True,
 ) -> Motion:
-    """The recorded motion on a body's joints, starting above the origin and standing on y = 0.
+    """Retarget a recording onto a body's joints, starting above the origin and standing on y = 0.
 
     Args:
         capture: the recording.
         body: to move.
         names: of its joints, CMU's or SMPL's.
-        fps: of the result; rotations between two frames are interpolated on the sphere.
-        abduct: degrees by which the upper arms are taken away from the trunk.
+        fps: frames per second of the result; rotations between two frames are interpolated on the sphere.
+        abduct: degrees by which the upper arms are taken outward.
         drop_clavicles: degrees by which the clavicles are lowered.
         freeze: keep hands, fingers and toes as in the canonical pose; captured ones are often noise.
 
@@ -115,19 +115,23 @@ def retarget(
     rotations = world.copy()
     rotations[:, 1:] = np.swapaxes(world[:, body.parents[1:]], -1, -2) @ world[:, 1:]
 
-    places = {name: body.joints[names.index(name)] for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")}
-    scale = leg_length(places) / leg_length({name: rest[source[name]] for name in places})
+    leg = {name: body.joints[names.index(name)] for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")}
+    scale = leg_length(leg) / leg_length({name: rest[source[name]] for name in leg})
     path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale - body.joints[0]
     return stand(Motion(rotations.astype(np.float32), path, float(fps)), body)
 
 
-def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...], standing: np.ndarray) -> np.ndarray:
-    """Rotations [T, J, 3, 3] of a body's joints from those that turn a T-pose.
+def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...], to_t_pose: np.ndarray) -> np.ndarray:
+    """Convert rotations relative to a T-pose to rotations relative to a body's canonical pose.
 
     Args:
-        local: [T, 3, 3] by joint name, relative to the parent; joints that are not named go with their parents.
+        local: [T, 3, 3] by joint name, relative to the parent; joints without an entry follow their parents.
+        body: to move.
         names: of the body's joints.
-        standing: [J, 3, 3] of `storage.canonical_rotation`.
+        to_t_pose: [J, 3, 3], from `storage.canonical_rotation`.
+
+    Returns:
+        Rotations [T, J, 3, 3], local to the parent.
     """
     frames = len(next(iter(local.values())))
     turned = np.zeros((frames, len(names), 3, 3))
@@ -135,14 +139,14 @@ def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...]
         turned[:, j] = turned[:, parent] if parent >= 0 else np.eye(3)
         if name in local:
             turned[:, j] = turned[:, j] @ local[name]
-    turned = turned @ standing
+    turned = turned @ to_t_pose
     rotations = turned.copy()
     rotations[:, 1:] = np.swapaxes(turned[:, body.parents[1:]], -1, -2) @ turned[:, 1:]
     return rotations
 
 
 def resample(capture: Capture, fps: float) -> Capture:
-    """The recording at another rate: every k-th frame, or interpolated where the rates are not multiples.
+    """Resample a recording: take every k-th frame, or interpolate if the rates are not multiples.
 
     Raises:
         ValueError: for a rate that is not > 0, or a recording of fewer than two frames.
@@ -167,13 +171,13 @@ def resample(capture: Capture, fps: float) -> Capture:
 
 
 def stand(motion: Motion, body: Body) -> Motion:
-    """The motion moved up or down, so that the body (betas 0) reaches below y = 0 in 2 % of the frames."""
+    """Move a motion up or down, so that the body (betas 0) reaches below y = 0 in 2 % of the frames."""
     turned = np.array(motion.rotations, np.float64)
     for j, parent in enumerate(body.parents):
         if parent >= 0:
             turned[:, j] = turned[:, parent] @ turned[:, j]
     shift = joint_positions(motion, body) - np.einsum("tjab,jb->tja", turned, body.joints)
-    rows = np.concatenate([turned[:, :, 1], shift[:, :, 1:2]], axis=-1)  # what gives y in each transform
+    rows = np.concatenate([turned[:, :, 1], shift[:, :, 1:2]], axis=-1)  # the row of each transform that gives y
     points = np.concatenate([body.vertices, np.ones((len(body.vertices), 1))], axis=1)
     weights = np.asarray(body.weights, np.float64)
     lowest = [np.einsum("vk,vk->v", weights @ row, points).min() for row in rows]
@@ -183,10 +187,10 @@ def stand(motion: Motion, body: Body) -> Motion:
 
 
 def read_lines(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each line that has any, of a text file or its .gz.
+    """Yield number and words of each line that is not blank, of a text file or its .gz.
 
     Raises:
-        ValueError: if it cannot be read.
+        ValueError: if the file cannot be read.
     """
     try:
         with (open_gzip if str(path).endswith(".gz") else open)(path, "rt", errors="replace") as file:
@@ -199,10 +203,10 @@ def read_lines(path: str | Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def numbers(path: str | Path, line: int, words: list[str], count: int | None = None) -> list[float]:
-    """Words as finite numbers.
+    """Convert words to finite numbers.
 
     Raises:
-        ValueError: naming file and line, if one is not a number or there are not `count` of them.
+        ValueError: naming file and line, if a word is not a number or there are not `count` of them.
     """
     try:
         values = [float(word) for word in words]
@@ -216,6 +220,8 @@ def numbers(path: str | Path, line: int, words: list[str], count: int | None = N
 
 
 def _corrections(abduct: float, drop_clavicles: float) -> dict[str, np.ndarray]:
+    """Return rotations [3, 3] by joint that take the upper arms outward and lower the clavicles, in degrees."""
+
     def about_z(degrees: float) -> np.ndarray:
         return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
 
@@ -228,13 +234,13 @@ def _corrections(abduct: float, drop_clavicles: float) -> dict[str, np.ndarray]:
 
 
 def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The shortest rotation that takes one direction to another; identity where one has no length."""
+    """Return the shortest rotation [3, 3] from one direction to another; identity if one has no length."""
     if np.linalg.norm(start) < 1e-9 or np.linalg.norm(end) < 1e-9:
         return np.eye(3)
     return Rotation.align_vectors(end[None], start[None])[0].as_matrix()
 
 
-def leg_length(places: dict[str, np.ndarray]) -> float:
-    """Length of the left leg, from hip to ankle, of joints by CMU's names."""
-    hip, knee, ankle = places["LeftUpLeg"], places["LeftLeg"], places["LeftFoot"]
+def leg_length(positions: dict[str, np.ndarray]) -> float:
+    """Return the length of the left leg, from hip to ankle, of joint positions by CMU's names."""
+    hip, knee, ankle = (positions[joint] for joint in ("LeftUpLeg", "LeftLeg", "LeftFoot"))
     return float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))

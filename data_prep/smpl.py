@@ -1,10 +1,10 @@
-"""Bodies of the SMPL family (SMPL, SMPL-H, SMPL-X), as their authors publish them.
+"""Bodies of the SMPL family (SMPL, SMPL-H, SMPL-X), from the files that their authors publish.
 
     python -m data_prep.smpl SMPL_FEMALE.pkl body.h5
     python -m data_prep.smpl SMPLX_NEUTRAL.npz body.h5 --shapes 16
 
-The files are not ours to give: register at smpl.is.tue.mpg.de, and mind their licence. A .pkl is read without chumpy,
-and nothing in it is run: of what pickle can build only arrays, numbers and texts are allowed.
+The files do not come with clothjax: register at smpl.is.tue.mpg.de, and mind their licence. A .pkl is read without
+chumpy, and no code in it is run: only arrays, numbers and texts are allowed.
 """
 
 import codecs
@@ -38,22 +38,22 @@ NAMES = {
 KEYS = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table")
 
 
-class _Built:
-    """Stands for an object of a class that is not loaded: only what it consists of."""
+class _Placeholder:
+    """Placeholder for an object of a class that is not loaded; holds its state."""
 
     def __setstate__(self, state):
         self.state = state
 
 
-class _Chumpy(_Built):
-    pass
+class _Chumpy(_Placeholder):
+    """Placeholder for a chumpy array."""
 
 
-class _Sparse(_Built):
-    pass
+class _Sparse(_Placeholder):
+    """Placeholder for a sparse matrix of scipy."""
 
 
-# what the published files ask for, by the names that it had when they were written and has now
+# classes and functions that the published files ask for, by their names of then and of now
 ALLOWED = {
     "numpy.ndarray": np.ndarray,
     "numpy.dtype": np.dtype,
@@ -73,6 +73,8 @@ ALLOWED = {
 
 
 class _Unpickler(pickle.Unpickler):
+    """Unpickler that loads nothing but ALLOWED."""
+
     def find_class(self, module: str, name: str):
         if f"{module}.{name}" not in ALLOWED:
             raise ValueError(f"it asks for {module}.{name}, which no body model needs: do not trust it")
@@ -80,7 +82,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of a model, dense, of those in KEYS and `posedirs`.
+    """Read the arrays in KEYS, and `posedirs` if there, of a model file, all dense.
 
     Raises:
         ValueError: naming the file, if it cannot be read, asks for code, or lacks an array.
@@ -89,46 +91,55 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
     try:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as file:
-                found = {key: file[key] for key in (*KEYS, "posedirs") if key in file.files}
+                arrays = {key: file[key] for key in (*KEYS, "posedirs") if key in file.files}
         else:
             with path.open("rb") as file:
-                whole = _Unpickler(file, encoding="latin1").load()
-            found = {key: _array(whole[key]) for key in (*KEYS, "posedirs") if key in whole}
+                model = _Unpickler(file, encoding="latin1").load()
+            arrays = {key: _array(model[key]) for key in (*KEYS, "posedirs") if key in model}
     except FileNotFoundError:
         raise
     except (pickle.UnpicklingError, *UNREADABLE) as error:
         raise ValueError(f"{path}: not a body model of the SMPL family: {error}") from error
-    missing = [key for key in KEYS if key not in found]
+    missing = [key for key in KEYS if key not in arrays]
     if missing:
         raise ValueError(f"{path}: has no {', '.join(missing)}: is it a body model of the SMPL family?")
-    return found
+    return arrays
 
 
 def _array(value) -> np.ndarray:
+    """Return the dense array of a value that was unpickled."""
     if isinstance(value, _Chumpy):
         value = value.state["x"]
     if isinstance(value, _Sparse):
         state = value.state
         shape = state["_shape"] if "_shape" in state else state["shape"]
         value = scipy.sparse.csc_matrix((state["data"], state["indices"], state["indptr"]), shape)
-        value.check_format(full_check=True)  # scipy would write where a wrong index says
+        value.check_format(full_check=True)  # toarray would write out of bounds for a wrong index
         value = value.toarray()
     return np.asarray(value)
 
 
 def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
-    """The body of a model file, with so many shape parameters, and its joint names.
+    """Read the body of a model file.
 
-    Its joints are linear in betas, as the model's regressor has them; pose blend shapes are kept.
+    The joints are linear in betas, by the model's regressor. Pose blend shapes are included.
+
+    Args:
+        path: .pkl or .npz as published.
+        shapes: number of shape parameters to use, the first ones.
+
+    Returns:
+        The body, and the names of its joints.
 
     Raises:
         ValueError: naming the file, the array and what is wrong with it.
     """
-    found = read(path)
+    arrays = read(path)
 
     def floats(key: str, *shape: int | None) -> np.ndarray:
+        """Return an array of the model as finite float64 of a shape, None for any size."""
         try:
-            array = np.asarray(found[key], np.float64)
+            array = np.asarray(arrays[key], np.float64)
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {key} is not of numbers ({error})") from error
         if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
@@ -158,7 +169,7 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
     faces = floats("f", None, 3)
     if faces.min() < 0 or faces.max() >= count:
         raise ValueError(f"{path}: f: a face names vertex {int(faces.max())} of {count}")
-    posedirs = floats("posedirs", count, 3, 9 * (joints - 1)).astype(np.float32) if "posedirs" in found else None
+    posedirs = floats("posedirs", count, 3, 9 * (joints - 1)).astype(np.float32) if "posedirs" in arrays else None
     return Body(
         vertices=vertices.astype(np.float32),
         faces=faces.astype(np.int32),
@@ -173,20 +184,20 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class Arguments:
-    """A body of the SMPL family as a body file."""
+    """Convert a body of the SMPL family to a body file."""
 
     model: tyro.conf.Positional[Path]
     """.pkl or .npz as published."""
     output: tyro.conf.Positional[Path]
     shapes: int = 10
-    """Shape parameters to keep, the first ones."""
+    """Number of shape parameters to use, the first ones."""
 
 
 def main(args: Arguments) -> None:
-    """Writes the file the arguments ask for."""
-    found, names = body(args.model, args.shapes)
-    save_body(args.output, found, names, name=args.output.stem, source=args.model.name, licence="of the model")
-    print(f"{args.output}: {len(found.vertices)} vertices, {len(names)} joints, {args.shapes} shape parameters")
+    """Write the body file."""
+    result, names = body(args.model, args.shapes)
+    save_body(args.output, result, names, name=args.output.stem, source=args.model.name, licence="of the model")
+    print(f"{args.output}: {len(result.vertices)} vertices, {len(names)} joints, {args.shapes} shape parameters")
 
 
 if __name__ == "__main__":

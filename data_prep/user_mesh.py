@@ -139,9 +139,9 @@ def read(path: str | Path) -> Mesh:
     starts = np.cumsum([0, *(len(part.vertices) for _, part in parts)])
     vertices = np.concatenate([np.asarray(part.vertices, np.float64) for _, part in parts])
     faces = np.concatenate([np.asarray(part.faces, np.int64) + start for (_, part), start in zip(parts, starts)])
-    wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(wrong):
-        raise ValueError(f"{path}: vertex {wrong[0] + 1} of {len(vertices)} is not finite: {vertices[wrong[0]]}")
+    infinite = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(infinite):
+        raise ValueError(f"{path}: vertex {infinite[0] + 1} of {len(vertices)} is not finite: {vertices[infinite[0]]}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path}: a face names vertex {faces.max() + 1} of {len(vertices)}")
     objects = {name: np.zeros(len(vertices), bool) for names, _ in parts for name in names}
@@ -320,8 +320,8 @@ def _orient(path: str | Path, working: Working, surface: Surface, flip: bool) ->
     corners = points[turned]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = np.bincount(part, ((points - nearest)[turned].mean(axis=1) * normal).sum(axis=1))
-    wrong = (outward < 0) != flip
-    turned = np.where(wrong[part][:, None], turned[:, ::-1], turned)
+    reverse = (outward < 0) != flip
+    turned = np.where(reverse[part][:, None], turned[:, ::-1], turned)
     changed = int((_winding(turned) != _winding(faces)).sum())
     working = working._replace(faces=turned)
     if not changed:

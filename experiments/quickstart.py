@@ -8,14 +8,13 @@ tshirt.onnx (with tshirt.json, how to drive it) and tshirt.glb. Run again, it go
 """
 
 import json
-import sys
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from clothjax.cli import fail_clearly, setup
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.evaluation import pictures
 from clothjax.evaluation.report import evaluate, table
@@ -34,6 +33,9 @@ ONNX_FRAMES = 100
 
 def main(argv: list[str]) -> None:
     started = time.monotonic()
+    cli.Parser("experiments.quickstart", __doc__, settings=True, add_help=False).parse_known_args(argv)
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
     config = configuration.cli(Config, [CONFIG, *argv])
     directory = run_directory(config, [CONFIG])
     clock = train(config, directory)
@@ -41,20 +43,20 @@ def main(argv: list[str]) -> None:
 
     print("measuring against the reference solver")
     report = evaluate(directory, settings=config.evaluation)
-    whole, _ = load_run(directory, config.evaluation)
+    experiment, _ = load_run(directory, config.evaluation)
     motion = config.evaluation.motions[0]
     betas = assembly.betas(config)
 
     print("exporting and drawing")
     model = inference.load(directory, betas=betas)
-    clip = assembly.motion(whole, motion)
+    clip = assembly.motion(experiment, motion)
     origin = clip.translation[0]
     part = Motion(clip.rotations[:ONNX_FRAMES], (clip.translation[:ONNX_FRAMES] - origin).astype(np.float32), clip.fps)
     onnx = to_onnx(specialise.specialise(model), directory / "tshirt.onnx")
     onnx_error = np.linalg.norm(run_onnx(onnx, model, part) - inference.animate(model, part)[0], axis=-1).max()
-    performance = pictures.perform(directory, whole, motion, config.evaluation.animation_frames)
+    performance = pictures.perform(directory, experiment, motion, config.evaluation.animation_frames)
     glb_error = to_glb(directory / "tshirt.glb", performance)
-    pictures.write_comparison(directory, whole, motion, directory / "comparison.png")
+    pictures.write_comparison(directory, experiment, motion, directory / "comparison.png")
     pictures.WRITERS[".webp"](directory / "walk.webp", performance)
 
     report = {
@@ -86,10 +88,10 @@ Garment {config.garment}, motion {", ".join(config.evaluation.motions)} (not tra
 {config.evaluation.betas_seed} within {config.evaluation.betas} standard deviations. Training took
 {figures["train_seconds"]:.0f} s: blend shapes and preconditioner {figures["start_seconds"]:.0f} s, stage 1
 {figures["stage1_seconds"]:.0f} s, the teacher's rollouts {figures["teacher_seconds"]:.0f} s, stage 2
-{figures["stage2_seconds"]:.0f} s, its tuning {figures.get("tuning_seconds", 0.0):.0f} s, compilation
+{figures["stage2_seconds"]:.0f} s, its fine-tuning {figures.get("tuning_seconds", 0.0):.0f} s, compilation
 {figures["compile_seconds"]:.0f} s.
 
-What the rows mean is in the docstring of `experiments/evaluate.py`. Gaps are over {config.evaluation.gap_frames}
+The rows are explained in the docstring of `clothjax/commands/evaluate.py`. Gaps are over {config.evaluation.gap_frames}
 frames of each motion; 0 is the reference solver, 1 plain skinning (`energy_gap`) or a garment that keeps its last
 canonical displacement (`hold_gap`).
 
@@ -100,6 +102,4 @@ ONNX Runtime against jax over {figures["onnx_frames"]} frames: {figures["onnx_er
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

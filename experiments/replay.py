@@ -10,8 +10,6 @@ and of each simulation of the batch its clip, frame, betas and material. The sta
 by one here, and twenty together in training: what is at the edge of diverging may not do so again.
 """
 
-import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,8 +17,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from clothjax import cli
 from clothjax.body.motion_clips import Clips
-from clothjax.cli import fail_clearly, setup
 from clothjax.config import Config
 from clothjax.files import checkpoint, configuration
 from clothjax.networks import animators, psi
@@ -32,8 +30,8 @@ from clothjax.training.pipeline import PHYSICS
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a run")
+    parser = cli.Parser("experiments.replay", __doc__)
+    cli.model_argument(parser, about="; it must have checkpoints")
     parser.add_argument("--stage", choices=PHYSICS, default=None, help="default: the last one begun")
     parser.add_argument("--steps", type=int, default=2000, help="at the most; default 2000")
     parser.add_argument(
@@ -43,16 +41,15 @@ def main(argv: list[str]) -> None:
         help="skipped steps in a row to put up with; default: as training",
     )
     arguments = parser.parse_args(argv)
-    begun = [stage for stage in PHYSICS if checkpoint.steps(arguments.run / stage / "checkpoints")]
+    run = cli.model_folder(arguments.model)
+    begun = [stage for stage in PHYSICS if checkpoint.steps(run / stage / "checkpoints")]
     if not begun or (arguments.stage and arguments.stage not in begun):
-        raise ValueError(
-            f"{arguments.run}: has no checkpoint of {arguments.stage or ' or '.join(PHYSICS)} to start from"
-        )
-    print(replay(arguments.run, arguments.stage or begun[-1], arguments.steps, arguments.allowed))
+        raise ValueError(f"{run}: has no checkpoint of {arguments.stage or ' or '.join(PHYSICS)} to start from")
+    print(replay(run, arguments.stage or begun[-1], arguments.steps, arguments.allowed))
 
 
 def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
-    """What the first step was made of from which on more in a row than `allowed` were not finite.
+    """A description of the first step from which on more in a row than `allowed` were not finite.
 
     Raises:
         ValueError: if the stage has finished.
@@ -62,9 +59,9 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
     total = getattr(config, stage).steps
     if found.step >= total:
         raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    update, turn, state = _again(run, stage, whole, reel)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    update, turn, state = _again(run, stage, experiment, reel)
     state, _ = checkpoint.restore(start, state)
     print(f"from step {found.step} of {start}", flush=True)
     end, skipped = min(found.step + steps, total), 0
@@ -82,7 +79,7 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
                 kept = run / stage / "diverged" / str(step)
                 if not kept.is_dir():
                     checkpoint.save(kept.parent, step, before, found.config)
-                return f"{error}\n{_said(step, metrics, turn(before), whole)}\nkept: {kept}"
+                return f"{error}\n{_said(step, metrics, turn(before), experiment)}\nkept: {kept}"
             report(step + 1 - found.step)
     return f"steps {found.step + 1} to {end} of {total} do not diverge; --steps takes more of them"
 
@@ -99,30 +96,32 @@ def _start(folder: Path) -> tuple[Path, checkpoint.Checkpoint]:
 
 
 def _again(
-    run: Path, stage: str, whole: assembly.Experiment, reel: Clips
+    run: Path, stage: str, experiment: assembly.Experiment, reel: Clips
 ) -> tuple[Callable, Callable, stage1.TrainingState]:
     """The training step of a stage, what tells the simulations of a step, and a state."""
-    config = whole.config
-    kept = psi.input_joints(whole.names, config.stage2)
+    config = experiment.config
+    kept = psi.input_joints(experiment.names, config.stage2)
     if stage == "tuning":
         _, garment, predictor, normalizers = trained.psi(run)
         phi = trained.phi(run)[1]["params"]
         animator = animators.psi_animator(
-            garment, normalizers, kept, fine_tuning.preconditioners(whole, reel, phi, normalizers, kept)
+            garment, normalizers, kept, fine_tuning.preconditioners(experiment, reel, phi, normalizers, kept)
         )
         config = fine_tuning.settings(config)
-        state = fine_tuning.init(predictor, whole.scene, reel, whole.config)
+        state = fine_tuning.init(predictor, experiment.scene, reel, experiment.config)
     elif config.peer.network:
         animator = animators.baseline_animator(kept)
-        state = stage1.init_peer(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
+        state = stage1.init_peer(
+            experiment.scene, reel, kept, laplacian_shapes.laplacian(experiment.scene, config), config
+        )
     else:
-        animator, state = animators.phi_animator, stage1.init(whole.scene, reel, config)
+        animator, state = animators.phi_animator, stage1.init(experiment.scene, reel, config)
 
     @partial(jax.jit, static_argnums=2)
     def turn(state: stage1.TrainingState, reel: Clips, frames: int):
-        return stage1.turn(state, whole.scene, reel, frames, config)
+        return stage1.turn(state, experiment.scene, reel, frames, config)
 
-    update = stage1.make_curriculum(whole.scene, reel, config, 1, None, animator)
+    update = stage1.make_curriculum(experiment.scene, reel, config, 1, None, animator)
     return update, lambda state: turn(state, reel, stage1.rollout_length(int(state.step), config)), state
 
 
@@ -130,12 +129,15 @@ def _said(
     step: int,
     metrics: loop.Metrics,
     simulations: tuple[np.ndarray, pool.Simulation],
-    whole: assembly.Experiment,
+    experiment: assembly.Experiment,
 ) -> str:
     """A bad step for a reader."""
     wrong = [name for name, values in metrics.items() if not np.isfinite(values[0])]
     lines = [f"step {step + 1}: not finite: {', '.join(wrong)}"]
-    clips = {name: len(assembly.motion(whole, name).translation) for name in assembly.training_motions(whole.config)}
+    clips = {
+        name: len(assembly.motion(experiment, name).translation)
+        for name in assembly.training_motions(experiment.config)
+    }
     begin = np.concatenate([[0], np.cumsum(list(clips.values()))])
     numbers, of_them = jax.device_get(simulations)
     for index, number in enumerate(numbers):
@@ -152,6 +154,4 @@ def _said(
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

@@ -3,27 +3,25 @@
     python -m experiments.ship runs/skirt skirt
 
 It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
-the validation motions, with the command that trained it and its hours. What `experiments.tune` left is packed already.
+the validation motions, with the command that trained it and its hours. A folder that `experiments.tune` left is packed
+already; of a garment that is there by that name only the report is made anew.
 """
 
-import argparse
 import json
 import shutil
-import sys
-from pathlib import Path
 
-from clothjax.cli import fail_clearly, setup
+from clothjax import cli
 from clothjax.evaluation.report import evaluate_packed, table
 from clothjax.runtime import trained
 from clothjax.training.run_folder import add_seconds, read_seconds
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run, or what experiments.tune left")
+    parser = cli.Parser("experiments.ship", __doc__)
+    cli.model_argument(parser, about="; such as experiments.tune left")
     parser.add_argument("name", help="of the garment")
     arguments = parser.parse_args(argv)
-    run, folder = arguments.run, trained.MODELS / arguments.name
+    run, folder = cli.model_folder(arguments.model), trained.MODELS / arguments.name
     if trained.packed(run):
         packed, about = run, trained.made(run)
     else:
@@ -41,12 +39,10 @@ def main(argv: list[str]) -> None:
     reports = evaluate_packed({arguments.name: packed})
     (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT):
+    for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT) if packed.resolve() != folder.resolve() else ():
         shutil.copy(packed / name, folder)
     print(f"{table(reports['mean'])}\nin {folder}")
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

@@ -13,13 +13,12 @@ import argparse
 import json
 import queue
 import re
-import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import submitit
 
-from clothjax.cli import fail_clearly, setup
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.evaluation.report import evaluate
 from clothjax.files import configuration
@@ -34,7 +33,7 @@ class Job(submitit.helpers.Checkpointable):
     """One training and its evaluation. A cluster that takes its machine away submits it again, and it resumes."""
 
     def __call__(self, arguments: list[str], directory: str) -> dict:
-        setup()
+        cli.setup()
         run = Path(directory)
         report = run / "evaluation.json"
         if report.exists():
@@ -53,8 +52,8 @@ def _configured(arguments: list[str], directory: str) -> Config:
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0], allow_abbrev=False)
-    parser.add_argument("config", help="configuration file; its settings may follow, as for experiments.train")
+    parser = cli.Parser("experiments.sweep", __doc__, settings=True)
+    parser.add_argument("config", help="configuration file; its settings may follow, as for `clothjax train`")
     parser.add_argument("--garments", nargs="+", default=None, help="asset names or paths; default: the configured one")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--directory", type=Path, default=Path("runs/sweep"))
@@ -88,7 +87,7 @@ def main(argv: list[str]) -> None:
 
 
 def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, dict], dict[str, str]]:
-    """What every job returned, and why the others did not."""
+    """The reports of the jobs that finished, and why the others did not."""
     finished, failed = {}, {}
     slots = queue.SimpleQueue()  # places for a job: the GPU it has there, if any
     places = [None] * len(jobs) if chosen.slurm is not None else chosen.gpus or [None] * chosen.at_once
@@ -141,7 +140,7 @@ def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
 
 
 def table(summary: dict[str, dict]) -> str:
-    """The figures of every job's Psi, or of its peer's network, as Markdown."""
+    """The figures of every job's Psi, or of its baseline, as Markdown."""
     rows = ["| | " + " | ".join(COLUMNS) + " |", "|---" * (1 + len(COLUMNS)) + "|"]
     for name, stages in summary.items():
         last = list(stages.values())[-1]
@@ -151,6 +150,4 @@ def table(summary: dict[str, dict]) -> str:
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

@@ -11,14 +11,12 @@ Ours (`configs/thesis.yaml`) and NCS (`configs/ncs.yaml`) have the same garment,
 have the numbers that they have in the thesis.
 """
 
-import argparse
 import base64
 import dataclasses
 import functools
 import html
 import io
 import json
-import sys
 from pathlib import Path
 
 import jax
@@ -27,11 +25,11 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
-from clothjax.cli import fail_clearly, setup
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.evaluation import pictures
 from clothjax.evaluation.report import evaluate
-from clothjax.evaluation.rollouts import load_run
+from clothjax.evaluation.rollouts import Tracks, load_run
 from clothjax.files import checkpoint, configuration, storage
 from clothjax.render import ray_cast
 from clothjax.runtime import inference, trained
@@ -73,7 +71,7 @@ FARNESS = 10.0  # deviations, of the broken code
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = cli.Parser("experiments.thesis", __doc__)
     parser.add_argument("--garments", nargs="+", choices=GARMENTS, default=GARMENTS)
     parser.add_argument("--out", type=Path, default=Path("runs") / "thesis", help="default: runs/thesis")
     parser.add_argument("--no-training", action="store_true", help="only of the runs that are there")
@@ -126,7 +124,7 @@ def cloth(name: str, folder: Path) -> str:
 
 
 def finished(run: Path, config: Config | None = None) -> bool:
-    """Whether the last stage of a run is at its last step.
+    """True where the last stage of a run is at its last step.
 
     Raises:
         ValueError: if it was trained with another configuration than this.
@@ -148,7 +146,7 @@ def finished(run: Path, config: Config | None = None) -> bool:
 
 @functools.cache
 def measures(run: Path) -> dict[str, dict[str, float]]:
-    """What `experiments.evaluate` says of each stage of a run."""
+    """The measures of each stage of a run, as of `clothjax evaluate`."""
     return evaluate(run)["evaluation"]
 
 
@@ -171,14 +169,14 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
             figures[garment] |= {name: values for name, values in measured.items() if name != "lbs"}
             config = trained.network(run)[0]
             motion = config.evaluation.motions[0]
-            with np.load(run / f"trajectories_{Path(motion).stem}.npz") as file:
-                tracks |= {name: file[name] for name in file.files if name not in ("lbs", "solver")}
-                solver = file["solver"]
-        whole = assembly.assemble(config)
-        rows, columns = pictures.at_moments(whole, motion, tracks | {"solver": solver}, MOMENTS)
+            kept = Tracks.load(run, motion)
+            tracks |= {name: track for name, track in kept.stages.items() if name != "lbs"}
+            solver = kept.solver
+        experiment = assembly.assemble(config)
+        rows, columns = pictures.at_moments(experiment, motion, tracks | {"solver": solver}, MOMENTS)
         parts.append(f"<h3>{garment}</h3>" + table(figures[garment]) + sheet(rows, columns))
     text = (
-        "<p>Every network in its own closed loop on a motion and a body that none has seen. A gap of 0 is the solver, "
+        "<p>Every network in its own rollout on a motion and a body that none has seen. A gap of 0 is the solver, "
         "1 plain skinning (energy) or cloth that keeps its shape (hold).</p>"
     )
     return figures, ("Figure 5: ours and NCS", text + "".join(parts))
@@ -207,8 +205,8 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
         figures[stage] = measures(of_it[key])[stage]
         config = trained.network(of_it[key])[0]
         motion = config.evaluation.motions[0]
-        with np.load(of_it[key] / f"trajectories_{Path(motion).stem}.npz") as file:
-            tracks |= {stage: file[stage], "solver": file["solver"]}
+        kept = Tracks.load(of_it[key], motion)
+        tracks |= {stage: kept.stages[stage], "solver": kept.solver}
     rows, columns = pictures.at_moments(assembly.assemble(config), motion, tracks, MOMENTS)
     text = "<p>Predictor, decoder and blend shapes trained on the losses alone, for the same time.</p>"
     return figures, (title, text + table(figures) + sheet(rows, columns))
@@ -221,12 +219,12 @@ def failure(runs: Runs) -> tuple[dict, Section]:
     if garment is None:
         return {}, (title, "<p>Needs a run of ours.</p>")
     run = runs[garment]["ours"]
-    whole, _ = load_run(run)
-    model = inference.load(run, betas=assembly.betas(whole.config))
+    experiment, _ = load_run(run)
+    model = inference.load(run, betas=assembly.betas(experiment.config))
     everywhere = Bounds(*(jnp.full_like(model.network.first, x) for x in (-1e9, 1e9, 0.0)))
     free = dataclasses.replace(model, network=model.network._replace(code_bounds=everywhere))
-    motion = whole.config.evaluation.motions[0]
-    clip = assembly.motion(whole, motion)
+    motion = experiment.config.evaluation.motions[0]
+    clip = assembly.motion(experiment, motion)
     poses = Pose(jnp.asarray(clip.rotations, jnp.float32), jnp.asarray(clip.translation, jnp.float32))
     sound = broken(model, poses, 0.0)
     tracks = {"as it is": broken(model, poses, FARNESS), "without bounds": broken(free, poses, FARNESS)}
@@ -236,12 +234,14 @@ def failure(runs: Runs) -> tuple[dict, Section]:
         axis.semilogy(np.arange(len(values)) - BROKEN, np.maximum(values, 1e-3), label=name)
     axis.set(xlabel="frames since the code was broken", ylabel="mm from the undisturbed garment")
     axis.legend()
-    body, _ = pictures.body_trajectory(whole, clip)
+    body, _ = pictures.body_trajectory(experiment, clip)
     moments = [BROKEN, BROKEN + 3, BROKEN + 10, BROKEN + 40]
     camera = ray_cast.camera_for(body[np.array(moments) - 1])
     rows = {
         name: [
-            ray_cast.render(pictures.dressed(whole, body[t - 1], track[t] - clip.translation[t]), camera, pictures.SIZE)
+            ray_cast.render(
+                pictures.dressed(experiment, body[t - 1], track[t] - clip.translation[t]), camera, pictures.SIZE
+            )
             for t in moments
         ]
         for name, track in (tracks | {"undisturbed": sound}).items()
@@ -295,7 +295,7 @@ def times(runs: Runs) -> tuple[dict, Section]:
     columns = {"us": "us a frame"} | {key: label.split(":")[0] for key, label in pareto.ERRORS.items()}
     won = ", ".join(f"{key}: {len(figures[key])}" for key in ("compared", "wins_at_equal_time", "wins_at_equal_error"))
     text = (
-        "<p>One character, weights in the cache; Psi and the networks of peers in ONNX Runtime on one thread, with "
+        "<p>One character, weights in the cache; Psi and the baselines in ONNX Runtime on one thread, with "
         "pose inputs and joint transforms given unless it says from the pose; C from the pose; jax on all cores. "
         f"Of the garments with both: {won}.</p>"
     )
@@ -365,6 +365,4 @@ def picture(png: bytes) -> str:
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

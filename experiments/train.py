@@ -1,53 +1,12 @@
-"""Trains both stages of an experiment; run it again to go on where it stopped.
+"""Trains both stages of an experiment: the same program as `python -m clothjax train`.
 
     python -m experiments.train configs/quickstart.yaml
-    python -m experiments.train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
-    python -m experiments.train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
 
-It leaves `stage1/`, `stage2/` and, where its steps are not 0, `tuning/` in the run's folder, each with checkpoints,
-metrics.jsonl and training.json.
-
-With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
-Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere each is told
-`--processes ADDRESS:PORT,COUNT,INDEX`. All of them need the run's folder.
+`clothjax/commands/train.py` tells the rest.
 """
 
-import argparse
-import sys
-
-import jax
-
-from clothjax.cli import fail_clearly, setup
-from clothjax.config import Config
-from clothjax.files import checkpoint, configuration
-from clothjax.runtime import trained
-from clothjax.training import devices
-from clothjax.training.pipeline import PHYSICS, run_directory, train
-
-
-def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--devices", default=None)
-    parser.add_argument("--processes", default="")
-    where, argv = parser.parse_known_args(argv)
-    config = configuration.cli(Config, argv)
-    devices.connect(where.processes)
-    directory = run_directory(config, argv)
-    with devices.together(directory):
-        wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
-        batches = [config.stage1.batch, config.stage2.batch]
-        batches += [config.tuning.batch] if config.tuning.steps > 0 else []
-        try:
-            train(config, directory, devices.choose(wanted, *batches))
-        except FloatingPointError as error:
-            *_, stage = [stage for stage in trained.STAGES if (directory / stage).is_dir()]
-            if stage not in PHYSICS or not checkpoint.steps(directory / stage / "checkpoints"):
-                raise
-            hint = f"`python -m experiments.replay {directory} --stage {stage}` shows what the bad step was made of"
-            raise FloatingPointError(f"{error}; {hint}") from error
-
+from clothjax import cli
+from clothjax.commands.train import main
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

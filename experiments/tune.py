@@ -1,22 +1,20 @@
-"""Tunes Psi of a garment that comes with the library, or of a packed one, further: on motions or bodies of yours.
+"""Fine-tunes Psi of a garment that comes with the library, or of a packed one, on motions or bodies of yours.
 
     python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000
 
 Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
 garment, for `clothjax.load` and all programs that take a run, with how it was made in report.json, and `tuning/`. Run
 again, it goes on where it stopped. A garment of the library is configured to be measured on motion capture too, which
-does not come with it: evaluate with `--motion walk_3`.
+does not come with it: evaluate with `--motions walk_3`.
 """
 
-import argparse
 import json
 import shlex
-import sys
 from pathlib import Path
 
 import jax
 
-from clothjax.cli import fail_clearly, setup
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.files import configuration
 from clothjax.networks import normalisation, psi
@@ -26,22 +24,24 @@ from clothjax.training import pipeline, stage2
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0], allow_abbrev=False)
-    parser.add_argument("garment", help="one that comes with the library, or the folder of a packed one")
+    parser = cli.Parser("experiments.tune", __doc__, settings=True)
+    cli.model_argument(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder to leave it in")
     given, settings = parser.parse_known_args(argv)
-    folder = Path(given.garment) if trained.packed(given.garment) else trained.folder(given.garment)
+    folder = cli.model_folder(given.model)
+    if not trained.packed(folder):
+        raise ValueError(f"{folder}: not a packed model; train a run further with `python -m clothjax train`")
     config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(given.out)])
     if config.tuning.steps < 1:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
     _, garment, predictor, normalizers = trained.psi(folder)
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    kept = psi.input_joints(whole.names, config.stage2)
-    seen = stage2.ordinary_poses(whole.scene, reel, kept, config)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    kept = psi.input_joints(experiment.names, config.stage2)
+    seen = stage2.ordinary_poses(experiment.scene, reel, kept, config)
     normalizers = normalizers._replace(pose=normalisation.widened(normalizers.pose, seen))
-    run = pipeline.Run(whole, given.out, reel, None)
+    run = pipeline.Run(experiment, given.out, reel, None)
     tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(garment, predictor, normalizers))
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
     made = trained.made(folder)
@@ -53,6 +53,4 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

@@ -348,7 +348,7 @@ def settings(network: str, **stage) -> Config:
 # Commands of the documents
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = ("README.md", "experiments/README.md")
+DOCUMENTS = ("README.md", "experiments/README.md", "clothjax/export/README.md", "data_prep/README.md")
 SMALL = (
     "--shapes.sequences 0 --model.descent_samples 0 --model.width 8 --model.blendshapes 24 --stage1.steps 20 "
     "--stage2.steps 20 --stage2.sequences 2 --stage2.frames 8 --stage2.rollout 2 --tuning.steps 20 --tuning.pool 2 "
@@ -366,11 +366,22 @@ def blocks(language: str) -> list[tuple[str, str]]:
     return found
 
 
+def sentences(text: str) -> list[str]:
+    """Return the sentences of a Markdown text; code, formulas, tables and headings are left out."""
+    text = re.sub(r"```.*?```|\$\$.*?\$\$", "", text, flags=re.DOTALL)
+    text = re.sub(r"(?m)^\s*([|#].*|)$", "\n", text)  # a table, a heading or an empty line ends a paragraph
+    paragraphs = re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", text)
+    plain = [
+        re.sub(r"`[^`]*`|\$[^$]*\$", "code", re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", each)) for each in paragraphs
+    ]
+    return [sentence for each in plain for sentence in re.split(r"(?<=[.!?])[\"')]*\s+", " ".join(each.split()))]
+
+
 def commands() -> list[str]:
-    """Every command of the documents, without its comment."""
+    """Return every command of the documents once, without its comment."""
     lines = "\n".join(block for _, block in blocks("sh")).replace("\\\n", " ").splitlines()
     stripped = [re.sub(r"\s+#.*", "", line).strip() for line in lines]
-    return [re.sub(r"\s+", " ", line) for line in stripped if line]
+    return list(dict.fromkeys(re.sub(r"\s+", " ", line) for line in stripped if line))
 
 
 def run(command: list[str], folder: Path) -> None:

@@ -208,7 +208,7 @@ def edge_strain(scene: Scene, character: Character, trajectory: Array) -> dict[s
 
 
 def beside_solver(scene: Scene, trajectory: Array, solved: Array, skinned: Array) -> dict[str, float]:
-    """How a trajectory compares with the reference solver's own closed loop, frame by frame.
+    """How a trajectory compares with the reference solver's own rollout, frame by frame.
 
     Args:
         trajectory, solved, skinned: [T, V, 3] m at the same frames, relative to the root.

@@ -9,15 +9,14 @@ import numpy as np
 
 from clothjax.body import skinning
 from clothjax.evaluation import rollouts
-from clothjax.evaluation.report import output_folder
-from clothjax.evaluation.rollouts import load_run, psi_trajectory, windows
+from clothjax.evaluation.rollouts import Tracks, load_run, psi_trajectory, windows
 from clothjax.networks.animators import phi_animator
 from clothjax.progress import progress_bar
 from clothjax.render import gltf, point_cache, ray_cast, usd
 from clothjax.render.performance import Part, Performance
 from clothjax.render.ray_cast import CLOTH, SKIN, Surface
 from clothjax.runtime import inference
-from clothjax.simulation import assembly, characters, reference
+from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.types import Motion, Pose
 
@@ -28,50 +27,53 @@ GALLERY_SIZE = (240, 480)
 
 
 def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Rows of pictures by method, and what each column shows."""
-    whole, phi = load_run(run)
-    config = whole.config
-    wearers = assembly.wearers(whole)
-    play = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, whole, c, p))
-    at = frame - 1  # what is measured starts at a clip's second frame
+    """Rows of pictures by method, and a label for each column."""
+    experiment, phi = load_run(run)
+    config = experiment.config
+    wearers = assembly.wearers(experiment)
+    play = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, experiment, c, p))
+    at = frame - 1  # trajectories start at a clip's second frame
     rows, columns = {"Phi": [], "Psi": [], "solver": []}, []
     with progress_bar("simulating", len(motions) * len(GALLERY_BODIES)) as report:
         for motion in motions:
-            clip = assembly.motion(whole, motion)
+            clip = assembly.motion(experiment, motion)
             if not 1 <= frame <= len(clip.translation) - 2:
                 raise ValueError(f"{motion} has frames 1 to {len(clip.translation) - 2} to show, not {frame}")
             clip = Motion(clip.rotations[: frame + 2], clip.translation[: frame + 2], clip.fps)
             poses = windows(clip)
             for shape in GALLERY_BODIES:
                 betas, material = wearers[f"{shape}, {GALLERY_CLOTH}"]
-                character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(betas, material)
+                character = assembly.dress(experiment, betas, material)
                 tracks = {
                     "Phi": np.asarray(play(phi, character, poses)),
                     "Psi": psi_trajectory(inference.load(run, betas=betas, material=material), clip),
-                    "solver": reference.simulate(whole.scene, character, poses, config)[0],
+                    "solver": reference.simulate(experiment.scene, character, poses, config)[0],
                 }
-                body, root = body_trajectory(whole, clip, betas)
+                body, root = body_trajectory(experiment, clip, betas)
                 camera = ray_cast.camera_for(body[at : at + 1])
                 floor = float((body + root[:, None])[..., 1].min() - root[at, 1])
                 for name, track in tracks.items():
-                    surfaces = dressed(whole, body[at], track[at])
+                    surfaces = dressed(experiment, body[at], track[at])
                     rows[name].append(ray_cast.render(surfaces, camera, GALLERY_SIZE, floor=floor))
                 columns.append(f"{Path(motion).stem}, {shape}")
                 report(len(columns))
     return rows, columns
 
 
-ROWS = {"lbs": "LBS", "phi": "Phi", "psi": "Psi", "solver": "reference solver"}
+ROWS = {"lbs": "LBS", "phi": "Phi", "psi": "Psi"}  # of a comparison, and the solver
 SIZE = (360, 480)
 
 
-def perform(run: Path, whole: Experiment, motion: str, frames: int) -> Performance:
+def perform(run: Path, experiment: Experiment, motion: str, frames: int) -> Performance:
     """Psi on the body over the frames of a clip, or alone where the scene has no body."""
-    clip = assembly.motion(whole, motion)
-    garment = psi_trajectory(inference.load(run, betas=assembly.betas(whole.config)), clip)[:frames]
-    body, root = body_trajectory(whole, clip)
-    parts = (Part("body", body[:frames], whole.body.faces, SKIN), Part("garment", garment, whole.garment.faces, CLOTH))
-    return Performance(parts if whole.scene.touchable else parts[1:], root[:frames], clip.fps)
+    clip = assembly.motion(experiment, motion)
+    garment = psi_trajectory(inference.load(run, betas=assembly.betas(experiment.config)), clip)[:frames]
+    body, root = body_trajectory(experiment, clip)
+    parts = (
+        Part("body", body[:frames], experiment.body.faces, SKIN),
+        Part("garment", garment, experiment.garment.faces, CLOTH),
+    )
+    return Performance(parts if experiment.scene.touchable else parts[1:], root[:frames], clip.fps)
 
 
 def film(write: Callable) -> Callable:
@@ -91,28 +93,25 @@ def film(write: Callable) -> Callable:
     return written
 
 
-def write_comparison(run: Path, whole: Experiment, motion: str, out: Path) -> None:
+def write_comparison(run: Path, experiment: Experiment, motion: str, out: Path) -> None:
     """Skinning, Phi, Psi and the reference solver at the same moments of a measured clip."""
-    path = output_folder(run) / f"trajectories_{Path(motion).stem}.npz"
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; run `python -m experiments.evaluate {run} --motion {motion}` first")
-    with np.load(path) as tracks:
-        tracks = {name: tracks[name] for name in ROWS}
-    rows, columns = at_moments(whole, motion, {label: tracks[name] for name, label in ROWS.items()})
+    tracks = Tracks.load(run, motion)
+    shown = {label: tracks.stages[name] for name, label in ROWS.items()} | {"reference solver": tracks.solver}
+    rows, columns = at_moments(experiment, motion, shown)
     ray_cast.comparison(out, rows, columns)
 
 
 def at_moments(
-    whole: Experiment, motion: str, tracks: dict[str, np.ndarray], count: int = 5
+    experiment: Experiment, motion: str, tracks: dict[str, np.ndarray], count: int = 5
 ) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Rows of pictures of trajectories [T, V, 3] m over a clip, all at the same moments, and what each column shows."""
-    body, root = body_trajectory(whole, assembly.motion(whole, motion))
+    """Rows of pictures of trajectories [T, V, 3] m over a clip at the same moments, and a label for each column."""
+    body, root = body_trajectory(experiment, assembly.motion(experiment, motion))
     moments = np.linspace(0, min(map(len, tracks.values())) - 1, count + 1)[1:].astype(int)
     floor = float((body + root[:, None])[moments][..., 1].min())
     camera = ray_cast.camera_for(body[moments])
     rows = {
         label: [
-            ray_cast.render(dressed(whole, body[t], track[t]), camera, SIZE, floor=floor - float(root[t, 1]))
+            ray_cast.render(dressed(experiment, body[t], track[t]), camera, SIZE, floor=floor - float(root[t, 1]))
             for t in moments
         ]
         for label, track in tracks.items()
@@ -120,29 +119,31 @@ def at_moments(
     return rows, [f"frame {t + 1}" for t in moments]
 
 
-def body_trajectory(whole: Experiment, clip: Motion, betas: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def body_trajectory(
+    experiment: Experiment, clip: Motion, betas: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The whole body [T - 2, B, 3] m at the frames that are measured, relative to its root [T - 2, 3] m.
 
     Args:
         betas: [S]; default: those of evaluation.
     """
-    betas = jnp.asarray(assembly.betas(whole.config) if betas is None else betas)
-    vertices = skinning.shaped_vertices(whole.body, betas)
-    joints = skinning.shaped_joints(whole.body, betas)
+    betas = jnp.asarray(assembly.betas(experiment.config) if betas is None else betas)
+    vertices = skinning.shaped_vertices(experiment.body, betas)
+    joints = skinning.shaped_joints(experiment.body, betas)
 
     @jax.jit
     def posed(rotations):
-        return skinning.pose_body(whole.body, vertices, joints, Pose(rotations, jnp.zeros(3)))
+        return skinning.pose_body(experiment.body, vertices, joints, Pose(rotations, jnp.zeros(3)))
 
     rotations = np.asarray(clip.rotations[1:-1], np.float32)
     translation = np.asarray(clip.translation[1:-1])
     return np.stack([np.asarray(posed(r)) for r in rotations]), translation - translation[0]
 
 
-def dressed(whole: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
+def dressed(experiment: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
     """The surfaces of a garment on a body, or of the garment alone where the scene has no body."""
-    cloth = [Surface(garment, whole.garment.faces)]
-    return [Surface(body, whole.body.faces, SKIN), *cloth] if whole.scene.touchable else cloth
+    cloth = [Surface(garment, experiment.garment.faces)]
+    return [Surface(body, experiment.body.faces, SKIN), *cloth] if experiment.scene.touchable else cloth
 
 
 WRITERS = {

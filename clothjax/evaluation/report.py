@@ -1,8 +1,8 @@
-"""All measures of a run as one nested dictionary, and as Markdown."""
+"""The measures of a run as one nested dictionary, and as Markdown."""
 
 import time
 from collections.abc import Callable
-from functools import partial
+from itertools import count
 from pathlib import Path
 
 import jax
@@ -11,25 +11,33 @@ import numpy as np
 
 from clothjax.config import EvaluationConfig
 from clothjax.evaluation import metrics, rollouts
-from clothjax.evaluation.rollouts import SETTLING_FRAMES, load_run, psi_trajectory, skinned_trajectory, windows
+from clothjax.evaluation.rollouts import (
+    SETTLING_FRAMES,
+    Tracks,
+    load_run,
+    output_folder,
+    psi_trajectory,
+    skinned_trajectory,
+    windows,
+)
 from clothjax.files import storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
 from clothjax.runtime import inference, trained
-from clothjax.simulation import assembly, characters, reference
+from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Motion
 
-CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the closed loop of each wearer, and where the solver is asked
+CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, and where the solver is asked
 
 
 def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
-    """The report of each garment under its name, and under `mean` the means of its stages over garments."""
+    """The report of each garment under its name, and under `mean` the means of the stages that all have."""
     if not folders:
-        raise ValueError("no garments come with this clothjax; pack some with experiments.ship")
+        raise ValueError("no garments come with this clothjax; train one with `python -m clothjax train`")
     reports = {}
     for name, folder in folders.items():
         there = motions
@@ -38,46 +46,42 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) 
             there = [motion for motion in wanted if storage.asset(motion).is_file()]
             print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
         reports[name] = evaluate(folder, there)
-    stages = next(iter(reports.values()))["evaluation"]
+    first, *others = (report["evaluation"] for report in reports.values())
+    stages = [stage for stage in first if all(stage in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
     return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in stages}} | flat
 
 
-def output_folder(run: Path) -> Path:
-    """The folder for the trajectories that are measured: the run's own, or one for a garment of the library."""
-    return Path("runs") / "pretrained" / run.name if trained.packed(run) else run
-
-
 def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None) -> dict:
-    """All measures, under `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`.
+    """The measures of a run, under `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`.
 
     Args:
         settings: default: those that the run was trained with.
     """
-    whole, model = load_run(run, settings, trained.network)
+    experiment, model = load_run(run, settings, trained.network)
     output_folder(run).mkdir(parents=True, exist_ok=True)
-    config = whole.config
+    config = experiment.config
     betas = assembly.betas(config)
-    stages = _stages(whole, model, run)
-    character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(
-        jnp.asarray(betas), configured_material(config)
-    )
+    stages = _stages(experiment, model, run)
+    character = assembly.dress(experiment, betas, configured_material(config))
     names = list(motions or config.evaluation.motions)
     if not names:
-        raise ValueError(f"{run}: none of its validation motions is here; name others with --motion")
-    garment = None if config.peer.network else model["params"]["garment"]
-    each, wearers = {}, {}
-    with progress_bar("evaluating", 4 * len(names) + 1) as report:
-        for index, name in enumerate(names):
-            clip = assembly.evaluation_motion(whole, name)
-            done = partial(lambda base, n: report(base + n), 4 * index)
-            path = output_folder(run) / f"trajectories_{Path(name).stem}.npz"
-            each[Path(name).stem] = _motion(whole, stages, garment, character, betas, clip, done, path)
-        first = assembly.motion(whole, names[0])
-        long = _long(whole, stages, character, first)
+        raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
+    shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
+    each, wearers, done = {}, {}, count(1)
+    with progress_bar("evaluating", 2 * len(names) + 1) as report:
+        for name in names:
+            clip = assembly.evaluation_motion(experiment, name)
+            tracks, converged = simulate(experiment, stages, character, clip)
+            report(next(done))
+            each[Path(name).stem] = measure(experiment, character, clip, tracks, converged, shapes)
+            tracks.save(run, name)
+            report(next(done))
+        first = assembly.motion(experiment, names[0])
+        long = _long(experiment, stages, character, first)
         if config.evaluation.wearers:
-            wearers = _characters(whole, stages, first)
-        report(4 * len(names) + 1)
+            wearers = _characters(experiment, stages, first)
+        report(next(done))
     return {
         "evaluation": {stage: _mean([one[stage] for one in each.values()]) | long.get(stage, {}) for stage in stages},
         "motions": each,
@@ -92,19 +96,20 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
 Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
 
 
-def _stages(whole: Experiment, model: dict, run: Path) -> dict[str, Stage]:
-    """What is measured, by name.
+def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
+    """The stages that are measured, by name.
 
     Args:
-        model: of `load_phi`.
+        model: of `load_run`.
     """
-    config = whole.config
-    peer = config.peer.network
-    make = animators.baseline_animator(input_joints(whole.names, config.stage2)) if peer else animators.phi_animator
-    play = jax.jit(lambda m, c, p: rollouts.states(make, m, whole, c, p))
+    config = experiment.config
+    baseline = config.peer.network
+    kept = input_joints(experiment.names, config.stage2)
+    make = animators.baseline_animator(kept) if baseline else animators.phi_animator
+    play = jax.jit(lambda m, c, p: rollouts.states(make, m, experiment, c, p))
 
     def skinned(character: Character, clip: Motion):
-        return lambda: skinned_trajectory(whole, character, windows(clip))
+        return lambda: skinned_trajectory(experiment, character, windows(clip))
 
     def network(character: Character, clip: Motion):
         poses = windows(clip)
@@ -116,95 +121,75 @@ def _stages(whole: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)
 
-    return {"lbs": skinned} | ({peer: network} if peer else {"phi": network, "psi": psi})
+    return {"lbs": skinned} | ({baseline: network} if baseline else {"phi": network, "psi": psi})
 
 
-def _motion(
-    whole: Experiment,
-    stages: dict[str, Stage],
-    garment: dict | None,
-    character: Character,
-    betas: np.ndarray,
-    clip: Motion,
-    done: Callable[[int], None],
-    path: Path,
-) -> dict:
-    """Measures of the stages on one clip; keeps its trajectories for pictures.
+def simulate(
+    experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion
+) -> tuple[Tracks, float]:
+    """The trajectories of the stages and of the reference solver, and the share of the solver's frames that converged.
 
-    Args:
-        garment: Phi's decoder and blend shapes.
+    The solver has the first `evaluation.solver_frames` frames.
     """
-    config = whole.config
     poses = windows(clip)
     frames = poses.translation.shape[0]
     tracks = {name: stage(character, clip)() for name, stage in stages.items()}
-    done(1)
-    solved, infos = reference.simulate(
-        whole.scene,
-        character,
-        jax.tree.map(lambda x: x[: min(config.evaluation.solver_frames, frames)], poses),
-        config,
-    )
-    done(2)
+    start = jax.tree.map(lambda x: x[: experiment.config.evaluation.solver_frames], poses)
+    solved, infos = reference.simulate(experiment.scene, character, start, experiment.config)
     solved = solved[:frames]  # of a clip shorter than that, the solver's goes one frame further
-    advance = np.asarray(poses.translation[:, 2])
-    count = len(solved)
-    rough = metrics.roughness(solved[SETTLING_FRAMES:], advance[SETTLING_FRAMES : count - 1])
-    sampled = np.unique(np.linspace(SETTLING_FRAMES, frames - 2, config.evaluation.gap_frames).astype(int))
-    strain = metrics.edge_strain(whole.scene, character, solved[SETTLING_FRAMES:])
-    result = {"solver": {"frames": count, "converged": float(np.mean([info.converged for info in infos])), **strain}}
-    for stage, track in tracks.items():
-        measured = metrics.gaps(
-            metrics.step_measures(
-                whole.scene,
-                character,
-                jnp.asarray(track),
-                poses,
-                sampled,
-                config,
-                garment["blendshapes"] if stage == "phi" else None,
-            )
-        )
-        if whole.scene.touchable:
-            measured |= metrics.penetrations(
-                whole.scene,
-                whole.body,
-                jnp.asarray(betas),
-                track,
-                poses,
-                range(SETTLING_FRAMES, frames, 4),
-                whole.names,
-            )
-        measured |= metrics.edge_strain(whole.scene, character, track[SETTLING_FRAMES:])
+    return Tracks(tracks, solved), float(np.mean([info.converged for info in infos]))
+
+
+def measure(
+    experiment: Experiment,
+    character: Character,
+    clip: Motion,
+    tracks: Tracks,
+    converged: float,
+    blendshapes: np.ndarray | None,
+) -> dict[str, dict]:
+    """The measures of the stages on one clip, by their names, and of the reference solver.
+
+    Args:
+        tracks, converged: of `simulate`.
+        blendshapes: of Phi, [K, V, 3] m; None where there is no Phi.
+    """
+    scene, settings = experiment.scene, experiment.config.evaluation
+    poses, solved = windows(clip), tracks.solver
+    frames, solver_frames = poses.translation.shape[0], len(tracks.solver)
+    late, common = slice(SETTLING_FRAMES, None), slice(SETTLING_FRAMES, solver_frames)
+    advance = np.asarray(poses.translation[:, 2])[SETTLING_FRAMES : solver_frames - 1]
+    roughness = metrics.roughness(solved[late], advance)
+    sampled = np.unique(np.linspace(SETTLING_FRAMES, frames - 2, settings.gap_frames).astype(int))
+    strain = metrics.edge_strain(scene, character, solved[late])
+    result = {"solver": {"frames": solver_frames, "converged": converged, **strain}}
+    for stage, track in tracks.stages.items():
+        span = blendshapes if stage == "phi" else None
+        steps = metrics.step_measures(scene, character, jnp.asarray(track), poses, sampled, experiment.config, span)
+        measured = metrics.gaps(steps)
+        if scene.touchable:
+            body, every_fourth = experiment.body, range(SETTLING_FRAMES, frames, 4)
+            measured |= metrics.penetrations(scene, body, character.betas, track, poses, every_fourth, experiment.names)
+        measured |= metrics.edge_strain(scene, character, track[late])
         measured["edge_strain_ratio"] = measured["edge_strain_p95"] / strain["edge_strain_p95"]
-        measured |= metrics.beside_solver(
-            whole.scene, *(x[SETTLING_FRAMES:count] for x in (track, solved, tracks["lbs"]))
-        )
-        measured["jitter"] = (
-            metrics.roughness(track[SETTLING_FRAMES:count], advance[SETTLING_FRAMES : count - 1]) / rough
-        )
+        measured |= metrics.beside_solver(scene, track[common], solved[common], tracks.stages["lbs"][common])
+        measured["jitter"] = metrics.roughness(track[common], advance) / roughness
         result[stage] = measured
-    done(4)
-    np.savez_compressed(
-        path,
-        **{k: np.asarray(v, np.float32) for k, v in tracks.items()},
-        solver=solved,
-    )
     return result
 
 
-def _characters(whole: Experiment, stages: dict[str, Stage], clip: Motion) -> dict[str, dict]:
-    """Gaps of all stages but skinning on nine wearers, over the start of a clip."""
-    config = whole.config
+def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) -> dict[str, dict]:
+    """Gaps of the stages but skinning on nine characters, over the start of a clip."""
+    config = experiment.config
     clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
     poses = windows(clip)
     sampled = np.linspace(SETTLING_FRAMES, len(clip.translation) - 4, CHARACTERS_GAPS).astype(int)
     result = {}
-    for name, (betas, material) in assembly.wearers(whole).items():
-        character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(betas, material)
+    for name, (betas, material) in assembly.wearers(experiment).items():
+        character = assembly.dress(experiment, betas, material)
         result[name] = {
             stage: metrics.gaps(
-                metrics.step_measures(whole.scene, character, make(character, clip)(), poses, sampled, config)
+                metrics.step_measures(experiment.scene, character, make(character, clip)(), poses, sampled, config)
             )
             for stage, make in stages.items()
             if stage != "lbs"
@@ -212,9 +197,9 @@ def _characters(whole: Experiment, stages: dict[str, Stage], clip: Motion) -> di
     return result
 
 
-def _long(whole: Experiment, stages: dict[str, Stage], character: Character, clip: Motion) -> dict[str, dict]:
-    """All stages but skinning over the long closed loop, with their times, and Psi against Phi."""
-    clip = assembly.there_and_back(clip, whole.config.evaluation.long_frames + 2)
+def _long(experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion) -> dict[str, dict]:
+    """Measures of the stages but skinning over the long rollout, with their times, and of Psi against Phi."""
+    clip = assembly.there_and_back(clip, experiment.config.evaluation.long_frames + 2)
     tracks, found = {}, {}
     for name in stages:
         if name == "lbs":

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,36 +21,71 @@ from clothjax.types import Array, Motion, Pose
 SETTLING_FRAMES = 5  # frames left out of averages over time: Psi starts from a garment as skinned
 
 
+class Tracks(NamedTuple):
+    """Trajectories [T - 2, V, 3] m of a garment over a motion, relative to the root."""
+
+    stages: dict[str, np.ndarray]  # by their names, as `lbs`, `phi` and `psi`
+    solver: np.ndarray  # of the reference solver; of a long motion, its start
+
+    def save(self, run: Path, motion: str) -> None:
+        """Keeps them with a run, for pictures."""
+        stages = {name: np.asarray(track, np.float32) for name, track in self.stages.items()}
+        np.savez_compressed(_tracks_path(run, motion), **stages, solver=self.solver)
+
+    @classmethod
+    def load(cls, run: Path, motion: str) -> "Tracks":
+        """Those that `save` left.
+
+        Raises:
+            ValueError: if there are none.
+        """
+        path = _tracks_path(run, motion)
+        if not path.is_file():
+            raise ValueError(f"{path}: no such file; run `python -m clothjax evaluate {run} --motions {motion}` first")
+        with np.load(path) as file:
+            stages = {name: file[name] for name in file.files if name != "solver"}
+            return cls(stages, file["solver"])
+
+
+def output_folder(run: Path) -> Path:
+    """The folder for trajectories that are kept: the run's own, or one for a garment of the library."""
+    return Path("runs") / "pretrained" / run.name if trained.packed(run) else run
+
+
+def _tracks_path(run: Path, motion: str) -> Path:
+    return output_folder(run) / f"trajectories_{Path(motion).stem}.npz"
+
+
 def windows(clip: Motion) -> Pose:
     """Every window of three poses in a clip, [T - 2, 3, ...]."""
     reel = jax.tree.map(jnp.asarray, assembly.windows(clip))
     return jax.vmap(lambda t: motion_clips.poses(reel, t))(jnp.arange(1, len(clip.translation) - 1))
 
 
-def skinned_trajectory(whole: Experiment, character: Character, poses: Pose) -> np.ndarray:
+def skinned_trajectory(experiment: Experiment, character: Character, poses: Pose) -> np.ndarray:
     """Plain skinning [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
 
     def one(pose):
-        window = characters.window(whole.scene, character, pose)
+        window = characters.window(experiment.scene, character, pose)
         return characters.skinned(character, window.current)
 
     return np.asarray(jax.jit(lambda p: jax.lax.map(one, p))(poses))
 
 
-def states(make: MakeAnimator, model: dict, whole: Experiment, character: Character, poses: Pose) -> Array:
+def states(make: MakeAnimator, model: dict, experiment: Experiment, character: Character, poses: Pose) -> Array:
     """An animator's rollout: [T, V, 3] m at the middle frame of each window, relative to its root."""
-    animator = make(model, whole.scene, character, whole.config)
-    return rollout.play(animator, whole.scene, character, poses, whole.config).states.position
+    animator = make(model, experiment.scene, character, experiment.config)
+    return rollout.play(animator, experiment.scene, character, poses, experiment.config).states.position
 
 
-def phi_trajectory(whole: Experiment, phi: dict, character: Character, poses: Pose) -> np.ndarray:
-    """Phi in closed loop: [T - 2, V, 3] m likewise."""
-    play = jax.jit(lambda m, p: states(phi_animator, m, whole, character, p))
+def phi_trajectory(experiment: Experiment, phi: dict, character: Character, poses: Pose) -> np.ndarray:
+    """Phi in an autoregressive rollout: [T - 2, V, 3] m likewise."""
+    play = jax.jit(lambda m, p: states(phi_animator, m, experiment, character, p))
     return np.asarray(play(phi, poses))
 
 
 def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
-    """Psi in closed loop: [T - 2, V, 3] m at the same frames, relative to the root."""
+    """Psi in an autoregressive rollout: [T - 2, V, 3] m at the same frames, relative to the root."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
     origin = part.translation[:1]
     local = part._replace(translation=(part.translation - origin).astype(np.float32), rotations=part.rotations)
@@ -64,7 +100,7 @@ def load_run(
 
     Args:
         evaluation: in the place of what the run was trained with.
-        read: `trained.network` takes a peer's network too.
+        read: `trained.network` takes a baseline's network too.
     """
     config, model = read(directory)
     return assembly.assemble(dataclasses.replace(config, evaluation=evaluation or config.evaluation)), model

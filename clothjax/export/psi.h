@@ -1,6 +1,6 @@
 /* Psi in plain C: one frame of a garment, from the pose of its wearer to its vertices.
  *
- * `python -m experiments.convert RUN --to c` writes a GARMENT.psi, this file and psi.c. C99 and nothing else; made with
+ * `python -m clothjax convert RUN --to c` writes a GARMENT.psi, this file and psi.c. C99 and nothing else; made with
  *
  *     cc -O3 -march=native -c psi.c
  *

@@ -45,6 +45,8 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
 def cli(cls: type[Config], argv: Sequence[str]) -> Config:
     """The configuration that a command line asks for: a YAML file, then overrides such as `--train.seed 3`.
 
+    Without a file, the overrides change the defaults of `cls`.
+
     Args:
         argv: the arguments, without the program's name. `--help` alone lists every setting with its default.
     """
@@ -53,10 +55,12 @@ def cli(cls: type[Config], argv: Sequence[str]) -> Config:
             return load(cls, argv[0], argv[1:])
         except ValueError as error:
             sys.exit(str(error))
-    usage = "CONFIG.yaml [--SETTING VALUE ...]"
+    usage = "[CONFIG.yaml] [--SETTING VALUE ...]"
     if {"-h", "--help"} & set(argv):
         return _override(cls, cls(), ["--help"], prog=usage)
-    sys.exit(f"the first argument must be a configuration file: {usage}; `--help` lists the settings")
+    if not argv:
+        sys.exit(f"give a configuration file, settings, or both: {usage}; `--help` lists the settings")
+    return _override(cls, cls(), argv, prog=usage)
 
 
 def to_dict(config: Any) -> Any:

@@ -15,9 +15,9 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
         vertex_count: V, by default the highest index plus one.
 
     Returns:
-        Mesh with hinges [H, 4], sorted by edge: the edge (a, b) as directed in its left face, then the vertices
-        opposite it in the left and in the right face. The left face is the first of the two in `faces`. An edge of
-        three or more faces makes one hinge of the first two, as in HOOD (Grigorev et al. 2023).
+        Mesh with hinges [H, 4], sorted by edge. A hinge is the edge (a, b) as directed in its left face, then the
+        vertices opposite it in the left and in the right face. The left face is the first of the two in `faces`.
+        An edge of three or more faces makes one hinge of the first two, as in HOOD (Grigorev et al. 2023).
 
     Raises:
         ValueError: if an index is out of range, a face has a vertex twice, or the array is not [F, 3] of integers.
@@ -38,7 +38,7 @@ def edges(faces: np.ndarray) -> np.ndarray:
 
 
 def directed(undirected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return senders and receivers [2 E] int32 of undirected edges [E, 2], sorted by receiver, then by sender."""
+    """Return senders and receivers [2 E] int32 of both directions of edges [E, 2], sorted by receiver, then sender."""
     undirected = np.asarray(undirected, np.int32).reshape(-1, 2)
     both = np.concatenate([undirected, undirected[:, ::-1]])
     both = both[np.lexsort((both[:, 0], both[:, 1]))]
@@ -46,14 +46,11 @@ def directed(undirected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def components(vertex_count: int, links: np.ndarray) -> np.ndarray:
-    """Number the connected component of every vertex, from zero in order of their lowest vertices.
+    """Return the connected component [V] int32 of every vertex, numbered from zero in order of their lowest vertices.
 
     Args:
         vertex_count: V.
         links: [E, 2] edges or [F, 3] faces.
-
-    Returns:
-        Component [V] int32.
     """
     links = np.asarray(links)
     ends = np.stack([links[:, :-1].ravel(), links[:, 1:].ravel()])

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from clothjax.body import skinning
 from clothjax.config import MaterialConfig, ModelConfig
+from clothjax.geometry.vectors import norm
 from clothjax.material import material_inputs
 from clothjax.physics import contact_search, energies
 from clothjax.simulation.characters import Character, Window
@@ -133,8 +134,8 @@ def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Ar
 
     def one(sign):
         parts = [
-            _rotate(turn, sign * offset_now), _length(offset_now), _rotate(turn, sign * offset_next),
-            _length(offset_next), _column(jnp.asarray(timestep), len(offset_now)),
+            _rotate(turn, sign * offset_now), norm(offset_now, keepdims=True), _rotate(turn, sign * offset_next),
+            norm(offset_next, keepdims=True), _column(jnp.asarray(timestep), len(offset_now)),
         ]  # fmt: skip
         return jnp.concatenate(parts, axis=-1)
 
@@ -156,7 +157,7 @@ def _canonical(
     drifted = state.position + state.velocity
     down = jnp.zeros_like(drifted).at[:, 1].set(-1.0)
     pull = force / (energies.GRAVITY * character.mass[:, None])
-    size = _length(pull)
+    size = norm(pull, keepdims=True)
     pull = pull * jnp.where(size > 1e-6, jnp.arcsinh(size) / jnp.maximum(size, 1e-6), 1.0)
     columns = [
         displacement,
@@ -182,13 +183,13 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
         template: [V, 3] m, at rest; turn: [3, 3] into the frame of the features; inputs: [3] the material, or [0].
     """
     rest = template[senders] - template[receivers]
-    rest_length = _length(rest)
+    rest_length = norm(rest, keepdims=True)
     now = points["now"][senders] - points["now"][receivers]
-    columns = [_rotate(turn, now), _length(now), rest, rest_length]
+    columns = [_rotate(turn, now), norm(now, keepdims=True), rest, rest_length]
     for name in ("held", "drifted"):
         if name in points:
             vector = points[name][senders] - points[name][receivers]
-            columns += [_length(vector) / rest_length - 1.0]
+            columns += [norm(vector, keepdims=True) / rest_length - 1.0]
     columns += [
         _column(jnp.asarray(timestep), len(senders)),
         jnp.broadcast_to(inputs[None], (len(senders), *inputs.shape)),
@@ -198,12 +199,6 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
 
 def _rotate(turn: Array, vectors: Array) -> Array:
     return jnp.einsum("ab,nb->na", turn, vectors, precision="highest")
-
-
-def _length(vectors: Array) -> Array:
-    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
-    zero = squared == 0
-    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def _column(scalar: Array, count: int) -> Array:

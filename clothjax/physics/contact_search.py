@@ -12,6 +12,7 @@ from clothjax.geometry.proximity import (
     nearest_point,
     winding_number,
 )
+from clothjax.geometry.vectors import unit
 from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
@@ -132,7 +133,7 @@ def find_on_self(positions: Float[Array, "V 3"], patches: Patches) -> SelfContac
     offset = positions - jnp.einsum("vk,vkc->vc", weights, here, precision="highest")
     apart = jnp.sum(offset * offset, axis=-1, keepdims=True)
     on_surface = apart < ON_SURFACE**2
-    across = _unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
+    across = unit(jnp.cross(here[:, 1] - here[:, 0], here[:, 2] - here[:, 0]))
     normal = jnp.where(on_surface, across, offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     return SelfContact(patches.faces[face], weights, jax.lax.stop_gradient(normal))
 
@@ -155,7 +156,7 @@ def centroids(
 ) -> tuple[Float[Array, "F 3"], Float[Array, "F 3"]]:
     """Centroids [F, 3] m and unit normals [F, 3] of the faces of a body [B, 3] m."""
     corners = vertices[faces]
-    return jnp.mean(corners, axis=1), _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return jnp.mean(corners, axis=1), unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def distance(
@@ -167,7 +168,7 @@ def distance(
 
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
     """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on; if it is a border."""
-    normals = _unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    normals = unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = patches.faces
     weighted = _angles(corners)[:, :, None] * normals[:, None]
     around = jnp.zeros_like(body).at[faces.reshape(-1)].add(weighted.reshape(-1, 3))
@@ -177,7 +178,7 @@ def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, we
     corner = faces[face, jnp.argmax(weights, axis=1)]
     border = jnp.where(count[:, 0] == 1, across == face, (count[:, 0] > 1) & patches.border[corner])
     edge = normals[face] + normals[across]
-    return _unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
+    return unit(jnp.where(count == 0, normals[face], jnp.where(count == 1, edge, around[corner]))), border
 
 
 def _areas(corners: Array) -> Array:
@@ -188,18 +189,13 @@ def _areas(corners: Array) -> Array:
 
 def _angles(corners: Array) -> Array:
     """Interior angles [F, 3] rad."""
-    sides = [_unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
+    sides = [unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]
     cosines = [-jnp.sum(sides[k] * sides[k - 1], axis=-1) for k in range(3)]
     return jnp.arccos(jnp.clip(jnp.stack(cosines, axis=1), -1.0, 1.0))
 
 
 def _axes(corners: Array) -> Array:
     """Orthonormal axes [V, 3, 3], as columns, that go with triangles [V, 3, 3] m."""
-    along = _unit(corners[:, 1] - corners[:, 0])
-    normal = _unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
+    along = unit(corners[:, 1] - corners[:, 0])
+    normal = unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
     return jnp.stack([along, jnp.cross(normal, along), normal], axis=-1)
-
-
-def _unit(vectors: Array) -> Array:
-    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
-    return jnp.where(squared > 0, vectors / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
+from clothjax.geometry.vectors import norm
 from clothjax.types import Array, Mesh, Rest, Scalar
 
 GRAVITY = 9.81  # m/s^2
@@ -26,8 +27,8 @@ def rest_measures(vertices: Float[Array, "V 3"], mesh: Mesh, flat: bool = True) 
     corners = vertices[mesh.faces]
     e0, e1 = corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]
     normal = jnp.cross(e0, e1)
-    double_area = _norm(normal)
-    length = _norm(e0)
+    double_area = norm(normal)
+    length = norm(e0)
     # the edge matrix in the basis (e0 / |e0|, in-plane normal to it) is upper triangular
     along = jnp.sum(e0 * e1, axis=-1) / length
     height = double_area / length
@@ -46,7 +47,7 @@ def rest_measures(vertices: Float[Array, "V 3"], mesh: Mesh, flat: bool = True) 
 def vertex_areas(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Float[Array, " V"]:
     """Area [V] m^2 that belongs to each vertex [V, 3] m: a third of its faces [F, 3]."""
     corners = vertices[faces]
-    areas = 0.5 * _norm(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    areas = 0.5 * norm(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     return jnp.zeros_like(vertices[:, 0]).at[faces.reshape(-1)].add(jnp.repeat(areas / 3.0, 3))
 
 
@@ -99,7 +100,7 @@ def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     left = jnp.cross(edge, offsets[:, 1])
     right = jnp.cross(offsets[:, 2], edge)
     sine = jnp.sum(jnp.cross(left, right) * edge, axis=-1)
-    cosine = jnp.sum(left * right, axis=-1) * _norm(edge)
+    cosine = jnp.sum(left * right, axis=-1) * norm(edge)
     # small again where faces are slivers, and arctan2's derivative squares them
     scale = jax.lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
     area = jnp.minimum(jnp.sum(left * left, axis=-1), jnp.sum(right * right, axis=-1))
@@ -157,12 +158,6 @@ def friction(
     return jnp.where(touching, coefficient * GRAVITY * mass * kappa * distance, 0.0)
 
 
-def _norm(vector: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-    squared = jnp.sum(vector * vector, axis=-1)
-    zero = squared == 0
-    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
-
-
 def _triangle_areas(hinges: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     a, b, c, d = hinges[:, 0], hinges[:, 1], hinges[:, 2], hinges[:, 3]
-    return 0.5 * (_norm(jnp.cross(b - a, c - a)) + _norm(jnp.cross(b - a, d - a)))
+    return 0.5 * (norm(jnp.cross(b - a, c - a)) + norm(jnp.cross(b - a, d - a)))

@@ -223,8 +223,7 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
     Raises:
         ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
     """
-    run = trained.folder(str(run)) if str(run) in trained.shipped() else run
-    config, garment, predictor, normalizers = trained.psi(run)
+    config, garment, predictor, normalizers = trained.psi(trained.find(run))
     body = storage.load_body(config.body)
     return build(
         config,

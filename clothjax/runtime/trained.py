@@ -1,4 +1,4 @@
-"""What training left: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
+"""Trained models: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
 A packed model is a folder with `model.npz` and `config.yaml`, and `report.json` where that says how it was made. Large
 matrices are kept in eight bits with a scale for each column (`NAME` and `NAME|scale`), the blend shapes and the
@@ -31,6 +31,24 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in MODELS.glob(f"*/{WEIGHTS}")))
 
 
+def find(model: str | Path) -> Path:
+    """The folder of a model: of a run, of a packed model, or of a garment that comes with the library, by its name.
+
+    A garment of the library comes before a folder that is called the same, which is found as `./skirt`.
+
+    Raises:
+        ValueError: if there is no such folder and no such garment.
+    """
+    if str(model) in shipped():
+        return MODELS / str(model)
+    if Path(model).is_dir():
+        return Path(model)
+    raise ValueError(
+        f"{model}: no such folder, and no garment called so comes with clothjax; give a run's folder, a packed folder "
+        f"or a name: {', '.join(shipped()) or 'none comes with this clothjax'}"
+    )
+
+
 def folder(name: str) -> Path:
     """Where a garment that comes with the library is.
 
@@ -46,19 +64,19 @@ def phi(run: str | Path) -> tuple[Config, dict]:
     """The configuration and the `params` and `statistics` of Phi, of a run or a packed model.
 
     Raises:
-        ValueError: if there is no readable one, as of a peer's run.
+        ValueError: if there is no readable one, as of a baseline's run.
     """
     config, model = network(run)
     if config.peer.network:
         raise ValueError(
-            f"{run}: is of a peer's network ({config.peer.network}), which has no Phi: only experiments.evaluate and "
+            f"{run}: is of a baseline ({config.peer.network}), which has no Phi: only `clothjax evaluate` and "
             "experiments.benchmark use it"
         )
     return config, model
 
 
 def network(run: str | Path) -> tuple[Config, dict]:
-    """As `phi`, or a peer's network in its place.
+    """As `phi`, or a baseline's network in its place.
 
     Raises:
         ValueError: if there is no readable one.
@@ -106,7 +124,7 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
 
 
 def packed(run: str | Path) -> bool:
-    """Whether a folder is a packed model."""
+    """True for a folder of a packed model."""
     return (Path(run) / WEIGHTS).is_file()
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -10,15 +11,16 @@ from clothjax.body import motion_clips, plausibility, skinning
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.files import storage
-from clothjax.simulation import scene
+from clothjax.simulation import characters, scene
+from clothjax.simulation.characters import Character
 from clothjax.simulation.scene import Scene
-from clothjax.types import Body, Garment, Material, Motion
+from clothjax.types import Array, Body, Garment, Material, Motion
 
 MEASURABLE = 12  # frames of a motion, at least, for all that is measured of it
 
 
 class Experiment(NamedTuple):
-    """What a configuration names, loaded."""
+    """The parts that a configuration names, loaded."""
 
     config: Config
     names: tuple[str, ...]  # of the joints
@@ -32,6 +34,12 @@ def assemble(config: Config) -> Experiment:
     body = storage.load_body(config.body)
     garment = storage.load_garment(config.garment, body)
     return Experiment(config, storage.joint_names(config.body), body, garment, scene.build_scene(garment, body, config))
+
+
+def dress(experiment: Experiment, betas: Array | np.ndarray, material: Material) -> Character:
+    """A character of shape `betas` [S] in cloth of `material`, compiled with the scene as a constant."""
+    dressed = jax.jit(lambda b, m: characters.dress(experiment.scene, b, m, experiment.config.physics))
+    return dressed(jnp.asarray(betas), material)
 
 
 def motion(experiment: Experiment, name: str) -> Motion:

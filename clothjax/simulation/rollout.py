@@ -87,6 +87,14 @@ def follow(state: ClothState, advance: Array) -> ClothState:
     return state._replace(position=state.position - advance[None])
 
 
+def advance(
+    animator: Animator, scene: Scene, character: Character, state: ClothState, poses: Pose, config: Config
+) -> tuple[ClothState, Array]:
+    """Take one frame of a motion: the state, relative to the root of the next frame, and the positions [V, 3] m."""
+    taken, (position, _, _) = take(animator, scene, character, state, poses, 1.0 / config.fps, config)
+    return follow(taken, poses.translation[2]), position
+
+
 def settle(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
     """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
     state = start(character, characters.window(scene, character, poses), animator.memory_size)
@@ -159,7 +167,7 @@ def play(animator: Animator, scene: Scene, character: Character, poses: Pose, co
     state = settle(animator, scene, character, first, config)
 
     def body(state, poses):
-        taken, (position, _, _) = take(animator, scene, character, state, poses, 1.0 / config.fps, config)
-        return follow(taken, poses.translation[2]), Track(position, state, taken.latent)
+        following, position = advance(animator, scene, character, state, poses, config)
+        return following, Track(position, state, following.latent)
 
     return jax.lax.scan(body, state, poses)[1]

@@ -73,8 +73,9 @@ class Psi(NamedTuple):
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
-    """Return where a run is kept: as configured, or named after its configuration file."""
-    return Path(config.directory or Path("runs") / Path(argv[0]).stem)
+    """The folder of a run: as configured, or named after its configuration file, or without one after its garment."""
+    name = config.garment if argv[0].startswith("-") else argv[0]
+    return Path(config.directory or Path("runs") / Path(name).stem)
 
 
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:

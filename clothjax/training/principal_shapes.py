@@ -96,10 +96,10 @@ def simulate(
         state = rollout.settle(animator, scene, character, first, config)
 
         def frame(state, poses):
-            taken, (new, _, _) = rollout.take(animator, scene, character, state, poses, 1.0 / config.fps, config)
+            state, new = rollout.advance(animator, scene, character, state, poses, config)
             transforms = characters.window(scene, character, poses).following.garment
             displaced = skinning.unapply(transforms, new) - character.template
-            return rollout.follow(taken, poses.translation[2]), displaced
+            return state, displaced
 
         return jax.lax.scan(frame, state, poses)[1]
 

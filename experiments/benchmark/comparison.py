@@ -1,6 +1,6 @@
 """Two reports of the benchmark beside each other: what has become slower or faster by more than noise.
 
-The noise is that of medians: what was measured once, as a compilation or a closed loop of Phi, may differ by more.
+The noise is that of medians: what was measured once, as a compilation or a rollout of Phi, may differ by more.
 """
 
 import math
@@ -28,7 +28,7 @@ def compare(new: dict, old: dict) -> dict:
 
 
 def times(part, place: str = "", timed: bool = False) -> dict[str, float]:
-    """All times of a report, by their place in it: what has a unit of time in its name, or in the name of the table it
+    """The times of a report, by their place in it: what has a unit of time in its name, or in the name of the table it
     is in."""
     if isinstance(part, dict):
         found = {}
@@ -49,7 +49,7 @@ def times(part, place: str = "", timed: bool = False) -> dict[str, float]:
 
 
 def lines(compared: dict) -> list[str]:
-    """What is to be read."""
+    """The comparison for a reader."""
     found = []
     if compared["other_machine"]:
         found.append(f"not the same machine as then: {', '.join(compared['other_machine'])} differ")

@@ -38,7 +38,7 @@ NEAR = 1.0  # mm, the error that is put up with
 
 
 def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS) -> dict:
-    """All figures: those against NCS at the paper's size, those of a garment of the library, floors and variants."""
+    """The figures: those against NCS at the paper's size, those of a garment of the library, floors and variants."""
     with tempfile.TemporaryDirectory() as folder:
         shipped = _shipped(Path(folder), rounds, frames)
         errors = {variant["name"]: variant["error_mm"] for variant in shipped["variants"]}
@@ -54,11 +54,13 @@ def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS)
 def paper_model() -> Model:
     """Psi at the size of the thesis on the 4 000-vertex t-shirt, with random weights."""
     config = configuration.cli(Config, PAPER)
-    whole = assembly.assemble(config)
-    kept = psi.input_joints(whole.names, config.stage2)
+    experiment = assembly.assemble(config)
+    kept = psi.input_joints(experiment.names, config.stage2)
     size, count = config.model.latent, 6 + 18 * len(kept) + 9 * (len(kept) - 1)
     random = np.random.default_rng(0)
-    basis = 1e-3 * random.standard_normal((config.model.blendshapes, len(whole.garment.vertices), 3)).astype(np.float32)
+    basis = 1e-3 * random.standard_normal((config.model.blendshapes, len(experiment.garment.vertices), 3)).astype(
+        np.float32
+    )
     garment = decoder.init(jax.random.key(0), size, jnp.asarray(basis), config.model)
     last = garment["decoder"][f"dense_{len(config.model.decoder)}"]
     last["kernel"] = 50.0 * last["kernel"]
@@ -69,7 +71,9 @@ def paper_model() -> Model:
         return Scale(jnp.zeros(size), jnp.ones(size), jnp.full(size, -8.0), jnp.full(size, 8.0))
 
     normalizers = Normalizers(scale(size), scale(count))
-    return inference.build(config, whole.garment, whole.body, whole.names, garment, predictor, normalizers)
+    return inference.build(
+        config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers
+    )
 
 
 def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
@@ -117,7 +121,7 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
 
 
 def _shipped(folder: Path, rounds: int, frames: int) -> dict:
-    """Variants of a garment of the library: time, bytes, and distance to jax's unspecialised model in closed loop."""
+    """Variants of a garment of the library: time, bytes, and distance to jax's unspecialised model in a rollout."""
     config = inference.load(SHIPPED).config
     betas = assembly.betas(config)
     model = inference.load(SHIPPED, betas=betas)
@@ -188,7 +192,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
 
 
 def _resting() -> dict:
-    """What is saved on a character that stops, and then is left alone once `resting` says so, and the error."""
+    """The time saved on a character that stops, and then is left alone once `resting` says so, and the error."""
     model = specialise.specialise(inference.load(SHIPPED))
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]

@@ -51,7 +51,7 @@ def measure(
         frames: of each motion; gaps: of them, at how many the solver is asked.
         motions: default: those on which all runs of a garment are evaluated.
         descent_steps: of Phi; iterations: of the solver, of which the last is until it has converged.
-        shapes: names of the forms of Psi and of peers with fewer blend shapes, and the part of them that they have.
+        shapes: names of the forms of Psi and of baselines with fewer blend shapes, and the part of them that they have.
 
     Raises:
         ValueError: if runs of a garment differ in body, physics, cloth or motions.
@@ -98,10 +98,10 @@ def wins(points: list[dict]) -> dict:
         if not (ours and theirs):
             continue
         won["compared"].append(garment)
-        whole = theirs["ncs"]
-        if not all(np.isfinite(whole[error]) for error in ERRORS):
+        published = theirs["ncs"]
+        if not all(np.isfinite(published[error]) for error in ERRORS):
             raise ValueError(f"the errors of NCS on {garment} are not finite: its training diverged; train it again")
-        usable = [p for p in theirs.values() if all(p[error] <= USABLE * whole[error] for error in ERRORS)]
+        usable = [p for p in theirs.values() if all(p[error] <= USABLE * published[error] for error in ERRORS)]
         fastest = min(usable, key=lambda p: p["us"])
         in_time = [p for p in ours.values() if p["us"] <= fastest["us"]]
         if any(all(p[error] < fastest[error] for error in ERRORS) for p in in_time):
@@ -122,7 +122,7 @@ def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
 
 
 def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
-    """Of so many `points` that two reports have in common, Kendall's tau of their order by time and by each error."""
+    """The `points` that two reports share, and Kendall's tau of their order by time and by each error."""
     named = {(p["garment"], p["run"], p["name"]): p for p in others}
     pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
     found = {"points": len(pairs)}
@@ -133,19 +133,21 @@ def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
 
 
 def _better(one: dict, other: dict, error: str) -> bool:
-    """Whether a point is no worse in time and error, and better in one."""
+    """True for a point that is no worse in time and error, and better in one."""
     no_worse = one["us"] <= other["us"] and one[error] <= other[error]
     return no_worse and (one["us"], one[error]) != (other["us"], other[error])
 
 
 def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps: int) -> dict[str, float]:
-    whole, measures, swings = case.whole, [], []
+    experiment, measures, swings = case.experiment, [], []
     for clip, track, reference in zip(case.clips, tracks, solved, strict=True):
         poses = windows(clip)
         frames = np.unique(np.linspace(SETTLING_FRAMES, len(track) - 2, gaps).astype(int))
-        measures += metrics.step_measures(whole.scene, case.character, jnp.asarray(track), poses, frames, whole.config)
-        skinned = skinned_trajectory(whole, case.character, poses)
-        beside = metrics.beside_solver(whole.scene, *(x[SETTLING_FRAMES:] for x in (track, reference, skinned)))
+        measures += metrics.step_measures(
+            experiment.scene, case.character, jnp.asarray(track), poses, frames, experiment.config
+        )
+        skinned = skinned_trajectory(experiment, case.character, poses)
+        beside = metrics.beside_solver(experiment.scene, *(x[SETTLING_FRAMES:] for x in (track, reference, skinned)))
         ratio, correlation = beside["swing_ratio"], beside["swing_correlation"]
         swings.append(ratio**2 + 1.0 - 2.0 * ratio * correlation)  # of |a - b|^2 / |b|^2
     found = metrics.gaps(measures)

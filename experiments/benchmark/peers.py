@@ -21,7 +21,7 @@ JOINTS = 15  # that NCS reads, as published
 
 
 class Peer(NamedTuple):
-    """A network in its garment, on a wearer."""
+    """A network in its garment, on a character."""
 
     network: str  # ncs or snug
     params: Params
@@ -96,7 +96,7 @@ def feed(path: Path) -> dict[str, np.ndarray]:
 
 
 def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Vertices [T, V, 3] m of a closed loop; of a graph that is not whole, codes [T, K].
+    """Vertices [T, V, 3] m of an autoregressive rollout; of a graph that is not whole, codes [T, K].
 
     Args:
         inputs: of each frame, but for `hidden`; what the graph does not read is left out.

@@ -24,7 +24,7 @@ NEAR = 0.03  # m, of the body, where contact is looked for
 
 
 class Xpbd:
-    """A garment on a wearer, moved from frame to frame.
+    """A garment on a character, moved from frame to frame.
 
     Args:
         substeps: of a frame, each with so many `iterations`.
@@ -33,11 +33,11 @@ class Xpbd:
         ImportError: if Newton is not installed.
     """
 
-    def __init__(self, whole: Experiment, character: Character, substeps: int, iterations: int):
+    def __init__(self, experiment: Experiment, character: Character, substeps: int, iterations: int):
         newton, _ = newton_and_warp()
-        scene, config = whole.scene, whole.config.physics
+        scene, config = experiment.scene, experiment.config.physics
         self.pinned = np.asarray(scene.garment.pinned)
-        self.substeps, self.timestep = substeps, 1.0 / (whole.config.fps * substeps)
+        self.substeps, self.timestep = substeps, 1.0 / (experiment.config.fps * substeps)
         rest, material = character.rest, character.material
         template, faces = np.asarray(character.template), np.asarray(scene.mesh.faces)
         mass = np.where(self.pinned, 0.0, np.asarray(character.mass))
@@ -105,14 +105,14 @@ def springs(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray, mu: floa
 
 
 def simulate(
-    engine: Xpbd, whole: Experiment, character: Character, poses: Pose, start: np.ndarray
+    engine: Xpbd, experiment: Experiment, character: Character, poses: Pose, start: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """A closed loop [T, V, 3] m relative to the root at every frame, and its median microseconds a frame.
+    """An autoregressive rollout [T, V, 3] m relative to the root at every frame, and its median microseconds a frame.
 
     Args:
         poses: windows [T, 3, ...]; start: [V, 3] m, relative to the root at the first frame, where it stands still.
     """
-    state, around = reference.problem(whole.scene, whole.config), _bodies(whole, character)
+    state, around = reference.problem(experiment.scene, experiment.config), _bodies(experiment, character)
     before = start - np.asarray(poses.translation[0, 0])
     track, clock = [start], []
     for frame in range(len(poses.translation) - 1):
@@ -121,16 +121,16 @@ def simulate(
         step, skinned, _, advance = state(character, before, now, window)
         velocity, skinned, bodies = (np.asarray(x) for x in (step.velocity, skinned, around(window)))
         began = time.perf_counter()
-        new = engine.step(now, whole.config.fps * velocity, skinned, bodies)
+        new = engine.step(now, experiment.config.fps * velocity, skinned, bodies)
         clock.append(1e6 * (time.perf_counter() - began))
         before = now
         track.append(new - np.asarray(advance))
     return np.stack(track), float(np.median(clock[1:]))
 
 
-def _bodies(whole: Experiment, character: Character) -> Callable[[Pose], jax.Array]:
+def _bodies(experiment: Experiment, character: Character) -> Callable[[Pose], jax.Array]:
     def both(poses: Pose) -> jax.Array:
-        window = characters.window(whole.scene, character, poses)
+        window = characters.window(experiment.scene, character, poses)
         return jnp.stack([window.current.body, window.following.body])
 
     return jax.jit(both)

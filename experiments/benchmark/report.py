@@ -17,14 +17,14 @@ on the same garment. The plot is of the cost against the vertices.
 
 `inference` times one frame on one thread, with weights in the cache: the paper's Psi (random weights, 4 000 vertices),
 NCS's network at its published sizes, and a trained garment of the library in its variants (in plain C too where there
-is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over 300 frames of closed
-loop. `floor_us` is how long this machine takes to read as many bytes.
+is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over a rollout of 300
+frames. `floor_us` is how long this machine takes to read as many bytes.
 
 `pareto` gives time and error, on one thread, of every way to move a garment: skinning, Psi and Phi in their variants,
-the solver stopped early, and runs of peers (`configs/ncs.yaml`). It takes folders of runs and names of shipped
-garments, by default all of these; what is compared on a garment must be trained for the same physics, wearers and
+the solver stopped early, and runs of baselines (`configs/ncs.yaml`). It takes folders of runs and names of shipped
+garments, by default all of these; what is compared on a garment must be trained for the same physics, bodies and
 motions. Phi and the solver are loops and take no turns: their times are of whole loops, or medians of their frames.
-Errors are those of `experiments.evaluate`, in closed loop on motions held out of training; `swing_error` is the rms
+Errors are those of `clothjax evaluate`, in rollouts on motions held out of training; `swing_error` is the rms
 error of the velocity of what skinning does not do, over the solver's.
 
 `--quick` is not for its figures: a small Phi, few rounds and frames, one garment; and not what mostly compiles, the
@@ -34,7 +34,6 @@ With `--compare OLD.json` the times of both reports are set beside each other, a
 the noise of both; of `pareto`, also whether both put the points in the same order (Kendall's tau).
 """
 
-import argparse
 import json
 import os
 import platform
@@ -45,6 +44,7 @@ from pathlib import Path
 
 import jax
 
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.files import configuration
 from clothjax.runtime import trained
@@ -69,22 +69,22 @@ QUICK = [  # what compiles soonest
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("runs", nargs="*", help="of the part pareto: folders of runs, names of shipped garments")
+    parser = cli.Parser("experiments.benchmark", __doc__)
+    cli.model_argument(parser, nargs="*", about="; for the part pareto, several")
     parser.add_argument("--part", choices=PARTS, default=None, help="default: all")
     parser.add_argument("--json", type=Path, default=Path("benchmark.json"))
     parser.add_argument("--plot", type=Path, default=None, help="default: beside the JSON")
     parser.add_argument("--quick", action="store_true", help="a small network, few rounds, little compilation")
     parser.add_argument("--compare", type=Path, default=None, help="the JSON of an earlier run")
     arguments = parser.parse_args(argv)
-    if arguments.part not in (None, "pareto") and arguments.runs:
+    if arguments.part not in (None, "pareto") and arguments.model:
         raise ValueError("runs are for the part pareto")
     before = earlier(arguments.compare) if arguments.compare else None
     path, plot = arguments.json, arguments.plot or arguments.json.with_suffix(".png")
     if arguments.part is None:
-        report = each_part(arguments.runs, arguments.quick, path, plot)
+        report = each_part(arguments.model, arguments.quick, path, plot)
     else:
-        report = measure(arguments.part, arguments.runs, arguments.quick)
+        report = measure(arguments.part, arguments.model, arguments.quick)
         draw(report, arguments.part, plot.with_suffix(f".{arguments.part}{plot.suffix}"))
     if before:
         report["compare"] = comparison.compare(report, before)
@@ -106,7 +106,7 @@ def draw(report: dict, part: str, path: Path) -> None:
 
 
 def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
-    """All parts, each in a process of its own: they differ in how many cores jax may use.
+    """Every part, each in a process of its own: they differ in how many cores jax may use.
 
     Args:
         kept: where the report so far is written after each part, should the next one fail.
@@ -139,8 +139,7 @@ def measure(part: str, names: list[str], quick: bool) -> dict:
             measured = inference.measure(**(QUICK_INFERENCE if quick else INFERENCE))
         else:
             names = names or (QUICK_GARMENTS if quick else trained.shipped())
-            runs = [trained.folder(name) if name in trained.shipped() else Path(name) for name in names]
-            measured = pareto.measure(runs, **(QUICK_PARETO if quick else PARETO))
+            measured = pareto.measure([cli.model_folder(name) for name in names], **(QUICK_PARETO if quick else PARETO))
     return {"machine": machine(), part: measured | {"peaks": timing.peaks(3), "noise": timing.noise()}}
 
 
@@ -161,7 +160,7 @@ def earlier(path: Path) -> dict:
 
 
 def training_step(quick: bool) -> dict:
-    """All figures of stage 1."""
+    """The figures of stage 1."""
     config = configuration.cli(Config, QUICK if quick else PAPER)
     if quick:
         return stage1.measure(config, QUICK_ROUNDS, compiling=False)
@@ -179,7 +178,7 @@ def training_step(quick: bool) -> dict:
 
 
 def machine() -> dict:
-    """What the figures were measured on."""
+    """The machine that the figures were measured on."""
     return {
         "device": str(jax.devices()[0].device_kind),
         "devices": jax.device_count(),

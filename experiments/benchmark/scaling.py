@@ -29,8 +29,8 @@ def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
         for done, size in enumerate(sizes):
             cloth = garment.build("tshirt", size, body, names)
             built = scene.build_scene(cloth, body, config)
-            whole = assembly.Experiment(config, names, body, cloth, built)
-            reel = reel or assembly.training_clips(whole)[0]
+            experiment = assembly.Experiment(config, names, body, cloth, built)
+            reel = reel or assembly.training_clips(experiment)[0]
             update = stage1.make_update(built, reel, config, 1, 1)
             programs[len(cloth.vertices)] = program(update, stage1.init(built, reel, config))
             report(done + 1)

@@ -1,4 +1,4 @@
-"""What a training step costs where the scene lacks something: what is absent is absent from the compiled program."""
+"""The cost of a training step where the scene lacks something: what is absent is not in the compiled program."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,9 +22,9 @@ POLE = 0.05  # of the width, held by the pole
 def _configured(**parts: dict) -> Change:
     """The same experiment with some settings of some parts of its configuration changed."""
 
-    def change(whole: Experiment) -> Experiment:
-        changed = {part: dataclasses.replace(getattr(whole.config, part), **new) for part, new in parts.items()}
-        return whole._replace(config=dataclasses.replace(whole.config, **changed))
+    def change(experiment: Experiment) -> Experiment:
+        changed = {part: dataclasses.replace(getattr(experiment.config, part), **new) for part, new in parts.items()}
+        return experiment._replace(config=dataclasses.replace(experiment.config, **changed))
 
     return change
 
@@ -32,17 +32,17 @@ def _configured(**parts: dict) -> Change:
 def _pinned(held: Callable[[np.ndarray], np.ndarray]) -> Change:
     """The same experiment with those vertices [V, 3] m held."""
 
-    def change(whole: Experiment) -> Experiment:
-        return whole._replace(garment=whole.garment._replace(pinned=held(whole.garment.vertices)))
+    def change(experiment: Experiment) -> Experiment:
+        return experiment._replace(garment=experiment.garment._replace(pinned=held(experiment.garment.vertices)))
 
     return change
 
 
 def _both(*changes: Change) -> Change:
-    def change(whole: Experiment) -> Experiment:
+    def change(experiment: Experiment) -> Experiment:
         for one in changes:
-            whole = one(whole)
-        return whole
+            experiment = one(experiment)
+        return experiment
 
     return change
 
@@ -56,7 +56,7 @@ def _waist(vertices: np.ndarray) -> np.ndarray:
 
 
 SCENES: dict[str, Change] = {
-    "full": lambda whole: whole,
+    "full": lambda experiment: experiment,
     "flag_on_a_pole": _both(_configured(physics={"body": "none"}), _pinned(_beside_a_pole)),
     "cloth_on_a_table": _configured(physics={"body": "still"}),
     "pinned_skirt": _pinned(_waist),
@@ -68,22 +68,24 @@ SCENES: dict[str, Change] = {
 }
 
 
-def build(whole: Experiment, name: str) -> Experiment:
+def build(experiment: Experiment, name: str) -> Experiment:
     """One of `SCENES`, of the same garment."""
-    changed = SCENES[name](whole)
+    changed = SCENES[name](experiment)
     return changed._replace(scene=scene.build_scene(changed.garment, changed.body, changed.config))
 
 
-def update(whole: Experiment):
+def update(experiment: Experiment):
     """A training step and the state it starts from."""
-    reel = _standing(whole) if whole.scene.still else assembly.training_clips(whole)[0]
-    return stage1.make_update(whole.scene, reel, whole.config, 1, 1), stage1.init(whole.scene, reel, whole.config)
+    reel = _standing(experiment) if experiment.scene.still else assembly.training_clips(experiment)[0]
+    return stage1.make_update(experiment.scene, reel, experiment.config, 1, 1), stage1.init(
+        experiment.scene, reel, experiment.config
+    )
 
 
-def _standing(whole: Experiment):
+def _standing(experiment: Experiment):
     """A reel of one pose."""
-    names = assembly.training_motions(whole.config)
-    clip = assembly.motion(whole._replace(scene=whole.scene._replace(still=False)), names[0])
+    names = assembly.training_motions(experiment.config)
+    clip = assembly.motion(experiment._replace(scene=experiment.scene._replace(still=False)), names[0])
     pose = Motion(np.repeat(clip.rotations[:1], 30, 0), np.repeat(clip.translation[:1], 30, 0), clip.fps)
     return motion_clips.concatenate([pose], [""], [np.zeros(0, int)], 2)
 
@@ -91,11 +93,11 @@ def _standing(whole: Experiment):
 def measure(config: Config, rounds: int) -> dict:
     """Flops, bytes and seconds of a training step in each scene, compiled without loops, and ratios to the full one."""
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
-    whole = assembly.assemble(config)
+    experiment = assembly.assemble(config)
     programs = {}
     with timing.unrolled(), progress_bar("compiling each scene", len(SCENES)) as report:
         for name in SCENES:
-            programs[name] = program(*update(build(whole, name)))
+            programs[name] = program(*update(build(experiment, name)))
             report(len(programs))
     seconds = interleaved(programs, rounds)
     figures = {name: {**cost(one), "seconds": seconds[name]} for name, one in programs.items()}

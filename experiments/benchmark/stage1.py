@@ -1,4 +1,4 @@
-"""What a training step of Phi costs, part by part."""
+"""The cost of a training step of Phi, part by part."""
 
 import dataclasses
 import tempfile
@@ -41,16 +41,16 @@ class Moment(NamedTuple):
 
 
 def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
-    """All figures of a training step at a configuration whose body nodes take part in message passing.
+    """The figures of a training step at a configuration whose body nodes take part in message passing.
 
     Args:
         compiling: measures too how long compilation takes.
     """
-    whole = assembly.assemble(config)
-    moment = first_moment(whole)
-    report = {"vertices": len(whole.garment.vertices), "width": config.model.width}
-    parts = [lambda: processor(whole, moment, rounds), lambda: convolution(whole, rounds)]
-    parts += [lambda: compilation(whole)] * compiling + [lambda: step(whole, moment, rounds)]
+    experiment = assembly.assemble(config)
+    moment = first_moment(experiment)
+    report = {"vertices": len(experiment.garment.vertices), "width": config.model.width}
+    parts = [lambda: processor(experiment, moment, rounds), lambda: convolution(experiment, rounds)]
+    parts += [lambda: compilation(experiment)] * compiling + [lambda: step(experiment, moment, rounds)]
     with progress_bar("measuring", len(parts)) as done:
         for index, part in enumerate(parts):
             report |= part()
@@ -58,13 +58,13 @@ def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
     return report
 
 
-def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
+def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
     """Encoder and processor, forward and backward, against the textbook's."""
-    config, state = whole.config, moment.state
+    config, state = experiment.config, moment.state
 
     def loss(form, model):
         def total(params, statistics, seen):
-            return jnp.mean(form(params, statistics, whole.scene, seen, model) ** 2)
+            return jnp.mean(form(params, statistics, experiment.scene, seen, model) ** 2)
 
         return jax.value_and_grad(total)
 
@@ -83,7 +83,7 @@ def processor(whole: Experiment, moment: Moment, rounds: int) -> dict:
 
     def difference():
         ours, theirs = (
-            np.asarray(jax.jit(lambda p, s, x, form=form: form(p, s, whole.scene, x, config.model))(*arguments))
+            np.asarray(jax.jit(lambda p, s, x, form=form: form(p, s, experiment.scene, x, config.model))(*arguments))
             for form in forms.values()
         )
         return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
@@ -107,12 +107,12 @@ def passed(params: dict, statistics: dict, scene: Scene, seen: Features, model: 
     return one.apply({"params": params, "statistics": statistics}, seen)
 
 
-def convolution(whole: Experiment, rounds: int) -> dict:
+def convolution(experiment: Experiment, rounds: int) -> dict:
     """The first block of the mesh convolution, forward and backward, against building every kernel."""
-    config = whole.config
+    config = experiment.config
     level = config.model.convolution[0]
-    count = len(whole.garment.vertices)
-    table = mesh_hierarchy.hierarchy(whole.garment.faces, count, [level.stride], [level.radius])[0]
+    count = len(experiment.garment.vertices)
+    table = mesh_hierarchy.hierarchy(experiment.garment.faces, count, [level.stride], [level.radius])[0]
     inputs, outputs = CONVOLUTION
     keys = jax.random.split(jax.random.key(0))
     block = MeshConvolution(outputs, config.model.convolution_bases, 0.0)
@@ -141,16 +141,16 @@ def convolution(whole: Experiment, rounds: int) -> dict:
     }
 
 
-def compilation(whole: Experiment) -> dict:
+def compilation(experiment: Experiment) -> dict:
     """Seconds until a training step on a rollout is traced and compiled: without, and with, a persistent cache."""
-    config = whole.config
-    reel, _ = assembly.training_clips(whole)
-    state = jax.eval_shape(lambda: stage1.init(whole.scene, reel, config))
+    config = experiment.config
+    reel, _ = assembly.training_clips(experiment)
+    state = jax.eval_shape(lambda: stage1.init(experiment.scene, reel, config))
 
     def once() -> float:
         jax.clear_caches()
         began = time.perf_counter()
-        jax.jit(stage1.make_update(whole.scene, reel, config, COMPILED_FRAMES, 1)).lower(state).compile()
+        jax.jit(stage1.make_update(experiment.scene, reel, config, COMPILED_FRAMES, 1)).lower(state).compile()
         return time.perf_counter() - began
 
     before = jax.config.jax_compilation_cache_dir
@@ -164,16 +164,16 @@ def compilation(whole: Experiment) -> dict:
             compilation_cache.reset_cache()
 
 
-def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
+def step(experiment: Experiment, moment: Moment, rounds: int) -> dict:
     """The training step and its pieces, beside the peaks of this machine; and a batch against single steps."""
-    config, scene = whole.config, whole.scene
+    config, scene = experiment.config, experiment.scene
     several = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, batch=BATCH, pool=BATCH))
     states = {"step": moment.state, "batch": stage1.init(scene, moment.clips, several)}
     updates = {
         name: stage1.make_update(scene, moment.clips, one, 1, 1)
         for name, one in {"step": config, "batch": several}.items()
     }
-    pieces = _pieces(whole, moment)
+    pieces = _pieces(experiment, moment)
     programs = {name: program(*piece) for name, piece in pieces.items()}
     programs |= {name: program(update, states[name]) for name, update in updates.items()}
     seconds = interleaved(programs, rounds)
@@ -181,7 +181,9 @@ def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
     # a loop would be counted once: without loops, and so without anything recomputed in them
     plain = dataclasses.replace(config, model=dataclasses.replace(config.model, remat=False))
     with timing.unrolled():
-        counted = {name: cost(program(*piece)) for name, piece in _pieces(whole._replace(config=plain), moment).items()}
+        counted = {
+            name: cost(program(*piece)) for name, piece in _pieces(experiment._replace(config=plain), moment).items()
+        }
     return {
         "step_seconds": seconds["step"],
         "step_temporary_mib": temporary_bytes(programs["step"]) / 2**20,
@@ -199,9 +201,9 @@ def step(whole: Experiment, moment: Moment, rounds: int) -> dict:
     }
 
 
-def _pieces(whole: Experiment, moment: Moment) -> dict:
+def _pieces(experiment: Experiment, moment: Moment) -> dict:
     """Functions, with their arguments, that together are most of a training step."""
-    config, scene = whole.config, whole.scene
+    config, scene = experiment.config, experiment.scene
     params, statistics = moment.state.params, moment.state.statistics
     simulation = jax.tree.map(lambda x: x[0], moment.state.pool)
     cloth, (character, window, step, seen) = simulation.cloth, moment.first
@@ -241,10 +243,10 @@ def _pieces(whole: Experiment, moment: Moment) -> dict:
     }
 
 
-def first_moment(whole: Experiment) -> Moment:
+def first_moment(experiment: Experiment) -> Moment:
     """The first moment of a training."""
-    clips = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
-    state = stage1.init(whole.scene, clips, whole.config)
+    clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
+    state = stage1.init(experiment.scene, clips, experiment.config)
     simulation = jax.tree.map(lambda x: x[0], state.pool)
-    first = jax.jit(lambda one: stage1.first_step(whole.scene, one, clips, whole.config))(simulation)
+    first = jax.jit(lambda one: stage1.first_step(experiment.scene, one, clips, experiment.config))(simulation)
     return Moment(state, clips, first)

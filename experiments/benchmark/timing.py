@@ -86,7 +86,7 @@ def unrolled() -> Iterator[None]:
 
 
 def peaks(rounds: int) -> dict[str, float]:
-    """What this machine reaches: flop/s in a product of float32 matrices, byte/s in adding to a long vector."""
+    """The peaks of this machine: flop/s in a product of float32 matrices, byte/s in adding to a long vector."""
 
     def stream(long):  # in place: fresh memory would be slower
         return jax.lax.fori_loop(0, PASSES, lambda _, a: a + 1.0, long)

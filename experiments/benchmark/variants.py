@@ -1,4 +1,4 @@
-"""All that can move a garment, in closed loop: Psi and Phi in their variants, peers, the solver, XPBD, skinning."""
+"""Rollouts by each thing that moves a garment: Psi and Phi in their variants, baselines, the solver, XPBD, skinning."""
 
 import dataclasses
 import tempfile
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from clothjax import material
@@ -22,7 +21,7 @@ from clothjax.files import storage
 from clothjax.networks import baselines, psi
 from clothjax.networks.animators import phi_animator
 from clothjax.runtime import inference, specialise, trained
-from clothjax.simulation import assembly, characters, reference
+from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Motion, Pose
@@ -43,22 +42,22 @@ class Variant(NamedTuple):
 
     family: str  # such as psi, ncs or solver
     runtime: str  # onnx, c, jax or warp
-    tracks: list[np.ndarray]  # closed loops [T - 2, V, 3] m over each of the clips, relative to the root
+    tracks: list[np.ndarray]  # rollouts [T - 2, V, 3] m over each of the clips, relative to the root
     call: Call | None  # one frame of it, to be timed beside the others
     us: float = 0.0  # a frame of the loop, where there is no `call`
     converged: float = 1.0  # share of a solver's frames
 
 
 class Case(NamedTuple):
-    """What the variants of a garment have in common."""
+    """The common ground of the variants of a garment."""
 
-    whole: Experiment
+    experiment: Experiment
     character: Character
     clips: list[Motion]
 
 
 def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
-    """What runs of a garment have in common: the wearer and the motions of the first one's evaluation."""
+    """The common ground of runs of a garment: the character and the motions of the first one's evaluation."""
     configs = [trained.network(run)[0] for run in runs]
     first = configs[0]
     wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
@@ -74,13 +73,11 @@ def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
     names = motions or [name for name in shared if storage.asset(name).is_file()]
     if not names:
         raise ValueError(f"{', '.join(map(str, runs))}: no motion is held out by all of them")
-    whole, _ = load_run(runs[0], None, trained.network)
-    character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, first.physics))(
-        jnp.asarray(assembly.betas(first)), material.configured_material(first)
-    )
-    clips = [assembly.motion(whole, name) for name in names]
+    experiment, _ = load_run(runs[0], None, trained.network)
+    character = assembly.dress(experiment, assembly.betas(first), material.configured_material(first))
+    clips = [assembly.motion(experiment, name) for name in names]
     clips = [Motion(clip.rotations[: frames + 2], clip.translation[: frames + 2], clip.fps) for clip in clips]
-    return Case(whole, character, clips)
+    return Case(experiment, character, clips)
 
 
 def every(
@@ -91,7 +88,7 @@ def every(
     iterations: tuple[int, ...],
     shapes: dict[str, float],
 ) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
-    """All variants of one garment by run and name, and the solver's own loops."""
+    """The variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
         network = trained.network(run)[0].peer.network
@@ -107,22 +104,22 @@ def every(
 
 
 def _skinning(case: Case, folder: Path) -> Variant:
-    whole = case.whole
-    weights, _ = _moving(whole)
+    experiment = case.experiment
+    weights, _ = _moving(experiment)
     g, path = Graph(), folder / "skinning.onnx"
     rest = np.asarray(case.character.template, np.float32).T.reshape(1, -1)
     garment = g("Identity", g.constant(rest))
     g("Transpose", g.skinned(garment, "transforms", weights), perm=[0, 2, 1], name="vertices")
     g.save(path, {"transforms": (1, len(weights), 12)}, {"vertices": (1, weights.shape[1], 3)})
-    tracks = [skinned_trajectory(whole, case.character, windows(clip)) for clip in case.clips]
+    tracks = [skinned_trajectory(experiment, case.character, windows(clip)) for clip in case.clips]
     return Variant("skinning", "onnx", tracks, bound(path, peers.feed(path)))
 
 
 def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
 
-    In ONNX Runtime it is timed as peers are, with pose inputs and skinning transforms given; and, as in C, from the
-    pose, which no peer does.
+    In ONNX Runtime it is timed as baselines are, with pose inputs and skinning transforms given; and, as in C, from the
+    pose, which no baseline does.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
     model = inference.load(run, betas=np.asarray(case.character.betas))
@@ -158,7 +155,7 @@ def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
 def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Variant]:
     """Phi with more and fewer steps of its descent, in jax."""
     config, model = trained.phi(run)
-    case = case._replace(whole=assembly.assemble(config))  # with the graph that it was trained on
+    case = case._replace(experiment=assembly.assemble(config))  # with the graph that it was trained on
     if config.model.latent_update != "descent":
         return {"phi": _loop(case, config, model)}
     varied = {
@@ -168,9 +165,9 @@ def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Var
 
 
 def _loop(case: Case, config: Config, model: dict) -> Variant:
-    """Phi's closed loop in jax, timed as a whole."""
-    whole, tracks, us = case.whole._replace(config=config), [], []
-    run = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, whole, c, p))
+    """Phi's rollout in jax, timed as a whole."""
+    experiment, tracks, us = case.experiment._replace(config=config), [], []
+    run = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, experiment, c, p))
     for clip in case.clips:
         poses = windows(clip)
         jax.block_until_ready(run(model, case.character, poses))  # compiles where the clip is of another length
@@ -183,20 +180,20 @@ def _loop(case: Case, config: Config, model: dict) -> Variant:
 def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
     folder = Path(tempfile.mkdtemp(dir=folder))
-    whole, character = case.whole, case.character
+    experiment, character = case.experiment, case.character
     config, model = trained.network(run)
     network = config.peer.network
-    kept = psi.input_joints(whole.names, config.stage2)
-    weights, moving = _moving(whole)
-    free = ~np.asarray(whole.scene.garment.pinned)
+    kept = psi.input_joints(experiment.names, config.stage2)
+    weights, moving = _moving(experiment)
+    free = ~np.asarray(experiment.scene.garment.pinned)
     peer = peers.made(network, model["params"], np.asarray(character.template), weights, free)
     constants = psi.constant_inputs(character.betas, character.material, config.material)
 
     @jax.jit
     def inputs(poses: Pose):
         def one(window):
-            seen = baselines.inputs(window, character.joints, constants, whole.scene.body.parents, kept, config)
-            moved = skinning.joint_transforms(window.rotations[2], character.joints, whole.scene.body.parents)
+            seen = baselines.inputs(window, character.joints, constants, experiment.scene.body.parents, kept, config)
+            moved = skinning.joint_transforms(window.rotations[2], character.joints, experiment.scene.body.parents)
             rows = {name: x if name == "dynamic" else x[None] for name, x in seen.items()}
             return rows | {"transforms": moved[moving].reshape(1, -1, 12)}
 
@@ -208,7 +205,7 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
 
     coding = peers.write(folder / "codes.onnx", peer, whole=False)
     try:
-        usual = [assembly.motion(whole, name) for name in specialise.CLIPS]
+        usual = [assembly.motion(experiment, name) for name in specialise.CLIPS]
     except ValueError:  # for another body
         usual = case.clips
     codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])
@@ -218,7 +215,7 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
         for name, part in shapes.items()
     }
     variants, seen = {}, [frames(clip) for clip in case.clips]
-    first = [skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:1], windows(c))) for c in case.clips]
+    first = [skinned_trajectory(experiment, character, jax.tree.map(lambda x: x[:1], windows(c))) for c in case.clips]
     for name, form in forms.items():
         for int8 in (False, True):
             path = peers.write(folder / f"{len(variants)}.onnx", form, int8=int8)
@@ -230,16 +227,16 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
 
 def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], list[np.ndarray]]:
     """The reference solver, stopped after some iterations; and its loops when it is not."""
-    whole, variants, solved = case.whole, {}, []
+    experiment, variants, solved = case.experiment, {}, []
     for iterations in limits:
         tracks, us, converged = [], [], []
         for clip in case.clips:
             clock = [time.perf_counter()]
             track, infos = reference.simulate(
-                whole.scene,
+                experiment.scene,
                 case.character,
                 windows(clip),
-                whole.config,
+                experiment.config,
                 max_iterations=iterations,
                 progress=lambda _, ticks=clock: ticks.append(time.perf_counter()),
             )
@@ -255,15 +252,15 @@ def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], li
 
 def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
     """XPBD, from where the solver starts; nothing where Newton is not installed."""
-    variants, whole = {}, case.whole
+    variants, experiment = {}, case.experiment
     for substeps, iterations in XPBD:
         try:
-            engine = Xpbd(whole, case.character, substeps, iterations)
+            engine = Xpbd(experiment, case.character, substeps, iterations)
         except ImportError as error:
             print(f"no points of XPBD: {error}")
             return {}
         loops = [
-            position_based.simulate(engine, whole, case.character, windows(clip), start)
+            position_based.simulate(engine, experiment, case.character, windows(clip), start)
             for clip, start in zip(case.clips, starts, strict=True)
         ]
         tracks, us = zip(*loops)
@@ -272,8 +269,8 @@ def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
     return variants
 
 
-def _moving(whole: Experiment) -> tuple[np.ndarray, np.ndarray]:
+def _moving(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
     """Skinning weights [J', V] of the joints that move the garment, and their indices."""
-    weights = np.asarray(whole.scene.garment.weights, np.float32)
+    weights = np.asarray(experiment.scene.garment.weights, np.float32)
     moving = np.flatnonzero(weights.max(axis=0) > 0)
     return weights[:, moving].T, moving

@@ -18,7 +18,6 @@ length of an edge in our bending energy is the present one, Newton's that at res
 number of iterations (`--iterations` a frame, shared by its substeps), so that at long steps it has not converged.
 """
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -28,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from clothjax import cli
 from clothjax.physics import incremental_potential
 from clothjax.physics.energies import GRAVITY
 from clothjax.progress import progress_bar
@@ -87,7 +87,7 @@ def energies(scene: Scene, position: np.ndarray) -> dict[str, float]:
 
 
 def pins(scene: Scene, position: np.ndarray) -> float:
-    """What membrane and bending at [V, 3] m pull at the pins, downwards, over the weight of the free vertices."""
+    """The downward pull of membrane and bending at [V, 3] m on the pins, over the weight of the free vertices."""
     step = Reference(scene, 1.0).time_step()
 
     def elastic(x):
@@ -180,7 +180,7 @@ def draw(out: Path, tracks: dict) -> None:
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = cli.Parser("experiments.compare_solvers", __doc__)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--substeps", nargs="+", type=int, default=[4], help=f"a frame; of `hang` always {AT_REST}")
     parser.add_argument("--frames", type=int, default=20, help=f"at {FPS} a second")

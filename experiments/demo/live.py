@@ -30,7 +30,7 @@ BODIES = 4  # that are shown, of a crowd
 
 
 class Outfit:
-    """A garment on a wearer, moved by each of the stages.
+    """A garment on a character, moved by each of the stages.
 
     Args:
         run: the folder of a run or of a packed model.
@@ -96,7 +96,7 @@ def _comparison(run: Path) -> "Comparison":
 
 
 class Comparison:
-    """What Psi is compared with, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
+    """The comparison of Psi, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
 
     def __init__(self, run: Path):
         self.config, model = trained.phi(run)
@@ -108,9 +108,7 @@ class Comparison:
             return animators.phi_animator(model, self.scene, character, config)
 
         def take(character, state, poses):
-            dt = 1.0 / config.fps
-            taken, (new, _, _) = rollout.take(phi(character), self.scene, character, state, poses, dt, config)
-            return rollout.follow(taken, poses.translation[2]), new
+            return rollout.advance(phi(character), self.scene, character, state, poses, config)
 
         def skinned(character, poses):
             return characters.skinned(character, characters.window(self.scene, character, poses).following)
@@ -120,13 +118,13 @@ class Comparison:
         self._problem = reference.problem(self.scene, config)
 
     def dress(self, betas: np.ndarray, material: Material | None) -> characters.Character:
-        """A wearer; the material defaults to the configured one."""
+        """A character; the material defaults to the configured one."""
         material = configured_material(self.config) if material is None else material
         material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
         return characters.dress(self.scene, jnp.asarray(betas, jnp.float32), material, self.config.physics)
 
     def step(self, stage: str, character, before: tuple | None, window: Pose) -> tuple:
-        """What a stage goes on from in the frame after the next, and the vertices [V, 3] m of the next, in the world.
+        """The state a stage goes on from in the frame after the next, and the next vertices [V, 3] m, in the world.
 
         Args:
             before: what it goes on from; None to begin.
@@ -148,7 +146,7 @@ class Comparison:
 
 
 class Steering:
-    """What the player wishes."""
+    """The wishes of the player."""
 
     def __init__(self):
         self.gait, self.heading = 0, 0.0
@@ -195,7 +193,7 @@ class Show:
         count: int = 1,
         fine: bool = False,
     ) -> None:
-        """Another garment, wearer or number of characters; `betas` may be some of those that the body has."""
+        """Another garment, body or number of characters; `betas` may be some of those that the body has."""
         config = trained.psi(run)[0]
         if config.fps != self.player.clips.fps:
             raise ValueError(f"the clips are at {self.player.clips.fps} frames a second, {run} at {config.fps}")
@@ -242,7 +240,7 @@ def _body(name: str):
 
 
 def _place(number: int, pose: Pose, first: Pose) -> np.ndarray:
-    """What a character of a crowd is moved by [3] m: it stands in its row behind the first."""
+    """The offset [3] m of a character of a crowd: it stands in its row behind the first."""
     row = int(np.sqrt(number))
     there = np.array([APART * (number - row * row - row), 0.0, -APART * row])
     return (there + (first.translation - pose.translation) * [1, 0, 1]).astype(np.float32)

@@ -1,8 +1,8 @@
 """A character that you steer, dressed by Psi, live in the browser.
 
     python -m experiments.demo                                      # or: make demo
-    python -m experiments.demo --garment dress --port 8080
-    python -m experiments.demo --run runs/my_skirt --motions clips/*.motion.h5
+    python -m experiments.demo dress --port 8080
+    python -m experiments.demo runs/my_skirt --motions clips/*.motion.h5
 
 Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the
 arrows are the viewer's own, for its camera. The panel has the same as the keys, the garment, body and cloth, and what
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from clothjax import cli
 from clothjax.body import motion_matching
 from clothjax.evaluation import metrics
 from clothjax.files import storage
@@ -188,7 +189,7 @@ class Viewer:
         return name
 
     def _label(self, stage: str, body: np.ndarray) -> str:
-        """What a stage is called, over its head."""
+        """The name of a stage, over its head."""
         name, place = f"/{stage}/name", (body[:, 0].mean(), body[:, 1].max() + 0.1, body[:, 2].mean())
         if name in self.meshes:
             self.meshes[name].position = place
@@ -210,9 +211,8 @@ class Viewer:
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--garment", default="skirt", choices=trained.shipped())
-    parser.add_argument("--run", type=Path, help="a run or packed model of yours, instead of those of the library")
+    parser = cli.Parser("experiments.demo", __doc__)
+    cli.model_argument(parser, nargs="?", default="skirt", about="; default: the skirt")
     parser.add_argument("--motions", type=Path, nargs="+", help="clips to go about by; default: the embedded ones")
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=8080)
@@ -243,9 +243,10 @@ def start(arguments: argparse.Namespace) -> Viewer:
     print(f"open {address} in a browser; stop with Ctrl-C", flush=True)
     if not arguments.no_browser:
         webbrowser.open(address)
-    garments, garment = {name: trained.folder(name) for name in trained.shipped()}, arguments.garment
-    if arguments.run is not None:
-        garments, garment = {arguments.run.name: arguments.run}, arguments.run.name
+    garments, garment = {name: trained.folder(name) for name in trained.shipped()}, arguments.model
+    if garment not in garments:  # a folder stands alone: its body may be another
+        folder = cli.model_folder(garment)
+        garments, garment = {folder.name: folder}, folder.name
     config = trained.psi(garments[garment])[0]
     body, names = storage.load_body(config.body), storage.joint_names(config.body)
     motions = clips(arguments.motions, names)

@@ -1,4 +1,4 @@
-// A character's garment in ONNX Runtime Web: one call a frame. `about` is the JSON that experiments.convert wrote.
+// A character's garment in ONNX Runtime Web: one call a frame. `about` is the JSON that clothjax convert wrote.
 
 export class Garment {
   constructor(ort, session, about) {

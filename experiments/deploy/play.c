@@ -3,7 +3,7 @@
  *     cc -O3 -march=native -I FOLDER play.c FOLDER/psi.c -lm -o play
  *     ./play FOLDER/tshirt.psi motion.bin vertices.bin
  *
- * FOLDER is where `experiments.convert --to c` has written. motion.bin has for every frame the rotations [joints][9]
+ * FOLDER is where `clothjax convert --to c` has written. motion.bin has for every frame the rotations [joints][9]
  * and the translation [3] as float32. Vertices [frames][vertices][3] are written as float32; the median time of a frame
  * is printed.
  */

@@ -3,7 +3,7 @@
  *     cc -O2 -I HEADERS play_onnx.c -L LIBRARIES -lonnxruntime -o play_onnx
  *     ./play_onnx tshirt.onnx motion.bin vertices.bin
  *
- * Beside tshirt.onnx lies tshirt.json, which experiments.convert wrote. motion.bin has for every frame the rotations
+ * Beside tshirt.onnx lies tshirt.json, which clothjax convert wrote. motion.bin has for every frame the rotations
  * [joints][9] and the translation [3] as float32. Vertices [frames][vertices][3] are written as float32; the median time
  * of a frame on one thread is printed.
  */

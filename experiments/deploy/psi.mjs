@@ -4,7 +4,7 @@
 //     node psi.mjs tshirt.onnx motion.json vertices.bin
 //
 // motion.json has `rotations` [T][J * 9] and `translation` [T][3]. Beside tshirt.onnx lies tshirt.json, which
-// experiments.convert wrote. Vertices [T, V, 3] are written as float32; the median time of a frame is printed.
+// clothjax convert wrote. Vertices [T, V, 3] are written as float32; the median time of a frame is printed.
 
 import { readFileSync, writeFileSync } from "node:fs";
 import * as ort from "onnxruntime-web";

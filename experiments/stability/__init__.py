@@ -1,1 +1,1 @@
-"""The three layers of the stress test: the energies, the reference solver, a trained run in closed loop."""
+"""The three layers of the stress test: the energies, the reference solver, a trained run in autoregressive rollouts."""

@@ -1,4 +1,4 @@
-"""A trained run in closed loop: long, beyond what it was trained on, and after shocks."""
+"""A trained run in autoregressive rollouts: long, beyond what it was trained on, and after shocks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +16,7 @@ from clothjax.material import configured_material
 from clothjax.physics import incremental_potential
 from clothjax.runtime import inference
 from clothjax.runtime.inference import Model
-from clothjax.simulation import assembly, characters, reference
+from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Motion, Pose
@@ -30,7 +30,7 @@ TELEPORT = 10.0  # m
 
 
 class Loop(NamedTuple):
-    """One closed loop."""
+    """One autoregressive rollout."""
 
     frames: int
     nonfinite: int  # frames
@@ -64,67 +64,69 @@ def _play(model: Model, poses: Pose):
     return jax.lax.scan(frame, inference.initial_state(model, first), poses)[1]
 
 
-def measure(whole: Experiment, character: Character, played: tuple) -> Loop:
-    """The figures of a closed loop."""
+def measure(experiment: Experiment, character: Character, played: tuple) -> Loop:
+    """The figures of a rollout."""
     vertices, latents, ok = played
     finite = np.isfinite(vertices).all(axis=(1, 2)) & np.isfinite(latents).all(axis=1)
     strain = (
-        metrics.edge_strain(whole.scene, character, vertices[finite])["edge_strain_max"] if finite.any() else np.inf
+        metrics.edge_strain(experiment.scene, character, vertices[finite])["edge_strain_max"]
+        if finite.any()
+        else np.inf
     )
     code = float(np.abs(latents[finite]).max(initial=0.0))
     return Loop(len(ok), int((~finite).sum()), int((~ok).sum()), code, strain)
 
 
 def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> dict:
-    """All loops of a run; `frames` for the longest. With `quick`, fewer variants."""
-    whole, phi = load_run(run)
-    config = whole.config
+    """Every rollout of a run; `frames` for the longest. With `quick`, fewer variants."""
+    experiment, phi = load_run(run)
+    config = experiment.config
     betas, cloth = assembly.betas(config), configured_material(config)
     load = partial(inference.load, run)
-    dress = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))
-    usual, character = load(betas=betas), dress(jnp.asarray(betas), cloth)
-    clip = assembly.motion(whole, config.evaluation.motions[0])
+    dress = partial(assembly.dress, experiment)
+    usual, character = load(betas=betas), dress(betas, cloth)
+    clip = assembly.motion(experiment, config.evaluation.motions[0])
     clip = clip._replace(translation=np.asarray(clip.translation - clip.translation[:1], np.float32))
     short = assembly.there_and_back(clip, min(frames, 300))
-    loops = {"long": measure(whole, character, play(usual, assembly.there_and_back(clip, frames)))}
+    loops = {"long": measure(experiment, character, play(usual, assembly.there_and_back(clip, frames)))}
 
     for scale in (0.5, 2.0):
         wearer = usual.wearer
         model = replace(usual, wearer=wearer._replace(joints=scale * wearer.joints, template=scale * wearer.template))
         larger = character._replace(template=scale * character.template)
         scaled = short._replace(translation=scale * short.translation)
-        loops[f"body scale {scale:g}"] = measure(whole, larger, play(model, scaled))
+        loops[f"body scale {scale:g}"] = measure(experiment, larger, play(model, scaled))
     for size in (-5.0, 5.0) if quick else (-5.0, -3.0, 3.0, 5.0):
         shape = np.full_like(betas, size)
-        loops[f"betas {size:+g}"] = measure(whole, dress(jnp.asarray(shape), cloth), play(load(betas=shape), short))
+        loops[f"betas {size:+g}"] = measure(experiment, dress(shape, cloth), play(load(betas=shape), short))
     for index, material in enumerate(corners(config)[:: 15 if quick else 1]):
         model = load(betas=betas, material=material)
-        loops[f"material {index}"] = measure(whole, dress(jnp.asarray(betas), material), play(model, short))
+        loops[f"material {index}"] = measure(experiment, dress(betas, material), play(model, short))
     for fps in (15.0, 120.0) if quick else (15.0, 24.0, 60.0, 90.0, 120.0):
         model = replace(usual, config=replace(config, fps=fps))
-        loops[f"{fps:g} frames/s"] = measure(whole, character, play(model, at_rate(short, fps)))
+        loops[f"{fps:g} frames/s"] = measure(experiment, character, play(model, at_rate(short, fps)))
     progress(1)
 
     frozen = freeze(short, BEFORE, min(frames, 2000) + SETTLING)
     played = play(usual, frozen)
-    loops["frozen pose"] = measure(whole, character, played)
+    loops["frozen pose"] = measure(experiment, character, played)
     drift = drift_mm(played[0][BEFORE + SETTLING :])
-    phi_track = phi_trajectory(whole, phi, character, windows(frozen))
+    phi_track = phi_trajectory(experiment, phi, character, windows(frozen))
     phi_drift = drift_mm(phi_track[BEFORE + SETTLING :])
     progress(2)
 
     base = assembly.there_and_back(clip, BEFORE + AFTER)
-    undisturbed = energies(whole, character, play(usual, base)[0], base)
+    undisturbed = energies(experiment, character, play(usual, base)[0], base)
     shocks = {}
     for name, motion in disturbed(base).items():
         played = play(usual, motion)
-        relative = energies(whole, character, played[0], base) / undisturbed
-        shocks[name] = Shock(measure(whole, character, played), recovery_frames(relative), relative)
+        relative = energies(experiment, character, played[0], base) / undisturbed
+        shocks[name] = Shock(measure(experiment, character, played), recovery_frames(relative), relative)
     progress(3)
-    phi_base = phi_trajectory(whole, phi, character, windows(base))
-    thrown = phi_trajectory(whole, phi, character, windows(disturbed(base)["teleport"]))
+    phi_base = phi_trajectory(experiment, phi, character, windows(base))
+    thrown = phi_trajectory(experiment, phi, character, windows(disturbed(base)["teleport"]))
     same = windows(base)
-    relative = energies_of(whole, character, thrown, same) / energies_of(whole, character, phi_base, same)
+    relative = energies_of(experiment, character, thrown, same) / energies_of(experiment, character, phi_base, same)
     progress(4)
     return {
         "loops": loops | {name: shock.loop for name, shock in shocks.items()},
@@ -178,21 +180,23 @@ def drift_mm(track: np.ndarray) -> np.ndarray:
     return 1e3 * np.linalg.norm(track - track[:1], axis=-1).max(axis=1)
 
 
-def energies(whole: Experiment, character: Character, track: np.ndarray, motion: Motion) -> np.ndarray:
+def energies(experiment: Experiment, character: Character, track: np.ndarray, motion: Motion) -> np.ndarray:
     """`energies_of` a track with a frame for every frame of the motion."""
-    return energies_of(whole, character, track[1:-1], windows(motion))
+    return energies_of(experiment, character, track[1:-1], windows(motion))
 
 
-def energies_of(whole: Experiment, character: Character, track: np.ndarray, poses: Pose) -> np.ndarray:
-    """What is stored in the cloth and in its motion at the steps of a track [T, V, 3] m, in J: [T - 2].
+def energies_of(experiment: Experiment, character: Character, track: np.ndarray, poses: Pose) -> np.ndarray:
+    """The energy stored in the cloth and in its motion at the steps of a track [T, V, 3] m, in J: [T - 2].
 
     All terms but gravity, whose zero is anywhere.
     """
-    state = reference.problem(whole.scene, whole.config)
+    state = reference.problem(experiment.scene, experiment.config)
 
     def energy(before, now, after, poses):
         step, _, _, advance = state(character, before, now, poses)
-        terms = incremental_potential.energies(after + advance[None], step, whole.scene.mesh, whole.config.physics)
+        terms = incremental_potential.energies(
+            after + advance[None], step, experiment.scene.mesh, experiment.config.physics
+        )
         return sum(value for name, value in terms.items() if name != "gravity")
 
     count = len(track) - 2

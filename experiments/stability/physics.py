@@ -39,7 +39,7 @@ def points(random: np.random.Generator, count: int, corners: int) -> np.ndarray:
 
 
 def terms(random: np.random.Generator, count: int) -> dict[str, tuple[Callable, np.ndarray, tuple]]:
-    """Of each term its energy of one element, `count` elements to take it at, and the rest of its arguments."""
+    """For each term its energy of one element, `count` elements to take it at, and the rest of its arguments."""
 
     def unit(vectors):
         return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
@@ -152,12 +152,12 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
         away: m, the distance of everything from the origin along all axes.
     """
     config = with_self_contact(config)
-    whole = assembly.assemble(config)
-    scene = whole.scene
+    experiment = assembly.assemble(config)
+    scene = experiment.scene
     character = characters.dress(
         scene, jnp.asarray(assembly.betas(config)), material.configured_material(config), config.physics
     )
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, config.evaluation.motions[0])))
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
 
     @jax.jit
     def state(key):

@@ -1,7 +1,7 @@
 """Stress-tests the energies, the reference solver and a trained run.
 
     python -m experiments.stability --json stability.json                   # the energies and the solver
-    python -m experiments.stability runs/quickstart --json stability.json   # and the run in closed loop
+    python -m experiments.stability runs/quickstart --json stability.json   # and rollouts of the run
     python -m experiments.stability runs/quickstart --quick                 # two minutes
 
 1. physics      random, extreme and degenerate configurations of every term in float32: how many have an energy, a
@@ -9,7 +9,7 @@
 2. solver       timesteps from 1/240 to 1/3 s, materials at the sixteen corners of the training ranges, a garment
                 squeezed to 1 % of its height, a body 20 cm from where it was. A case is `recovered`, `reported` (the
                 last frame's `SolverInfo.ok` is false) or `silent`: it says ok of what is broken.
-3. closed loop  Psi over thousands of frames, on bodies, cloths and frame rates beyond its training, with its pose
+3. rollouts     Psi over thousands of frames, on bodies, cloths and frame rates beyond its training, with its pose
                 frozen, and after shocks: a jump of 10 m, a frame of NaN, a half-turn of one frame. Recovery is counted
                 in frames until the energy is within 10 % of the undisturbed loop's and stays there; drift is the way of
                 the farthest vertex over 2 000 frames of one pose. Phi's figures stand beside Psi's.
@@ -17,7 +17,6 @@
 What brings a state back is described in `clothjax/runtime/inference.py`.
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -25,6 +24,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
+from clothjax import cli
 from clothjax.config import Config
 from clothjax.progress import progress_bar
 from experiments.stability import closed_loop, physics, solver
@@ -35,12 +35,12 @@ ORIGINS = (0.0, 100.0)  # m
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("run", type=Path, nargs="?", default=None, help="folder of a finished run")
+    parser = cli.Parser("experiments.stability", __doc__)
+    cli.model_argument(parser, nargs="?", about="; default: only the energies and the solver")
     parser.add_argument("--json", type=Path, default=Path("stability.json"))
     parser.add_argument("--quick", action="store_true", help="a tenth of it")
     arguments = parser.parse_args(argv)
-    report, curves = stress(arguments.run, arguments.quick)
+    report, curves = stress(arguments.model and cli.model_folder(arguments.model), arguments.quick)
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
     arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     picture = arguments.json.with_suffix(".png")
@@ -50,7 +50,7 @@ def main(argv: list[str]) -> None:
 
 
 def stress(run: Path | None, quick: bool = False) -> tuple[dict, dict]:
-    """All three layers: what goes into the JSON file, and the curves of the third for the picture."""
+    """The three layers: the content of the JSON file, and the curves of the third for the picture."""
     report = {"physics": _physics(1000 if quick else 10000), "float32": _precision(quick)}
     frames = 3 if quick else 10
     with progress_bar("solver", 7 if quick else 24) as done:
@@ -69,7 +69,7 @@ def stress(run: Path | None, quick: bool = False) -> tuple[dict, dict]:
             report["solver"] |= {f"seconds_per_frame_{size}": timed["seconds"], f"walk_{size}": timed}
     if run is None:
         return report, {}
-    with progress_bar("closed loop", 4) as done:
+    with progress_bar("rollouts", 4) as done:
         measured = closed_loop.stress(run, 1000 if quick else 10000, quick, done)
     loops, shocks = measured["loops"], measured["shocks"]
     recovery = {name: shock.recovery for name, shock in shocks.items()}
@@ -136,7 +136,7 @@ def readable(report: dict) -> str:
             )
     if "closed_loop" in report:
         loop = report["closed_loop"]
-        rows += ["", "| closed loop | frames | not finite | outside training | code, sd | strain |", "|---" * 6 + "|"]
+        rows += ["", "| rollout | frames | not finite | outside training | code, sd | strain |", "|---" * 6 + "|"]
         for name, case in loop["loops"].items():
             cells = (
                 case["frames"],
@@ -154,7 +154,7 @@ def readable(report: dict) -> str:
 
 
 def plot(report: dict, curves: dict, path: Path) -> None:
-    """A picture of the layers: errors of float32, the solver's cases, the closed loops."""
+    """A picture of the layers: errors of float32, the solver's cases, the rollouts."""
     figure, axes = plt.subplots(2, 2, figsize=(13, 9), constrained_layout=True)
     first, second, third, fourth = axes.reshape(-1)
     places = report["float32"]["terms"]

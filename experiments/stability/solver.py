@@ -15,7 +15,7 @@ from clothjax.evaluation import metrics
 from clothjax.evaluation.rollouts import windows
 from clothjax.material import configured_material
 from clothjax.physics import solver
-from clothjax.simulation import assembly, characters, reference
+from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Material, Pose
@@ -50,13 +50,12 @@ def corners(config: Config) -> list[Material]:
 
 def stress(config: Config, frames: int, quick: bool, progress: Callable[[int], None]) -> dict[str, Outcome]:
     """Every case, `frames` frames each; with `quick`, one of a kind."""
-    whole = assembly.assemble(config)
-    betas, cloth = jnp.asarray(assembly.betas(config)), configured_material(config)
-    poses = windows(assembly.motion(whole, config.evaluation.motions[0]))
-    dress = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))
-    usual = dress(betas, cloth)
+    experiment = assembly.assemble(config)
+    betas, cloth = assembly.betas(config), configured_material(config)
+    poses = windows(assembly.motion(experiment, config.evaluation.motions[0]))
+    usual = assembly.dress(experiment, betas, cloth)
     first = jax.tree.map(lambda x: x[:2], poses)
-    trajectory, _ = reference.simulate(whole.scene, usual, first, config)
+    trajectory, _ = reference.simulate(experiment.scene, usual, first, config)
     settled = (trajectory[1], trajectory[2])
     later = jax.tree.map(lambda x: x[2 : 2 + frames], poses)
     low = settled[1].min(axis=0) * [0, 1, 0]
@@ -66,29 +65,29 @@ def stress(config: Config, frames: int, quick: bool, progress: Callable[[int], N
     cases |= {f"timestep 1/{round(1 / dt)} s": (usual, 1 / dt, settled) for dt in TIMESTEPS[:: 4 if quick else 1]}
     for index, material in enumerate(corners(config)[:: 15 if quick else 1]):
         name = ", ".join(f"{float(x):.3g}" for x in material)
-        cases[f"material {index}: {name}"] = (dress(betas, material), config.fps, settled)
+        cases[f"material {index}: {name}"] = (assembly.dress(experiment, betas, material), config.fps, settled)
     cases["squeezed to 1 %"] = (usual, config.fps, squeezed)
     cases["body 20 cm aside"] = (usual, config.fps, elsewhere)
     outcomes = {}
     for done, (name, (character, fps, start)) in enumerate(cases.items()):
-        outcomes[name] = _run(whole, replace(config, fps=fps), character, later, start)
+        outcomes[name] = _run(experiment, replace(config, fps=fps), character, later, start)
         progress(done + 1)
     return outcomes
 
 
-def _run(whole: Experiment, config: Config, character: Character, poses: Pose, start: tuple) -> Outcome:
+def _run(experiment: Experiment, config: Config, character: Character, poses: Pose, start: tuple) -> Outcome:
     began = time.perf_counter()
     seconds = [began]
     trajectory, infos = reference.simulate(
-        whole.scene, character, poses, config, start=start, progress=lambda _: seconds.append(time.perf_counter())
+        experiment.scene, character, poses, config, start=start, progress=lambda _: seconds.append(time.perf_counter())
     )
     last = trajectory[-1:]
     finite = bool(np.isfinite(trajectory).all())
-    strain = metrics.edge_strain(whole.scene, character, last)["edge_strain_max"] if finite else np.inf
+    strain = metrics.edge_strain(experiment.scene, character, last)["edge_strain_max"] if finite else np.inf
     inside = (
-        metrics.penetrations(whole.scene, whole.body, character.betas, last, _next(poses), [0], whole.names)[
-            "penetration_percent"
-        ]
+        metrics.penetrations(
+            experiment.scene, experiment.body, character.betas, last, _next(poses), [0], experiment.names
+        )["penetration_percent"]
         if finite
         else np.inf
     )
@@ -110,14 +109,12 @@ def _next(poses: Pose) -> Pose:
 
 def seconds_per_frame(config: Config, frames: int) -> dict[str, float]:
     """Median seconds a frame of a walk takes, body contact included, the share of frames that converged."""
-    whole = assembly.assemble(config)
-    character = jax.jit(lambda b, m: characters.dress(whole.scene, b, m, config.physics))(
-        jnp.asarray(assembly.betas(config)), configured_material(config)
-    )
-    poses = windows(assembly.motion(whole, config.evaluation.motions[0]))
+    experiment = assembly.assemble(config)
+    character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
+    poses = windows(assembly.motion(experiment, config.evaluation.motions[0]))
     stamps: list[float] = []
     _, infos = reference.simulate(
-        whole.scene, character, jax.tree.map(lambda x: x[: frames + 1], poses), config,
+        experiment.scene, character, jax.tree.map(lambda x: x[: frames + 1], poses), config,
         progress=lambda _: stamps.append(time.perf_counter()),
     )  # fmt: skip
     seconds = np.diff(stamps)  # the first frame compiles
@@ -127,6 +124,6 @@ def seconds_per_frame(config: Config, frames: int) -> dict[str, float]:
         "converged": float(np.mean([info.converged for info in infos])),
         "relative_gradient": float(max(info.relative_gradient for info in infos)),
         "frames": len(seconds),
-        "vertices": len(whole.garment.vertices),
+        "vertices": len(experiment.garment.vertices),
         "tolerance": solver.TOLERANCE,
     }

@@ -1,23 +1,22 @@
 """Builds a page that plays garments in the browser alone: no Python, and nothing but a file server, behind it.
 
     python -m experiments.web.build --out site
+    python -m experiments.web.build skirt runs/mine --motions walk_3 dance_3 --out site
     python -m http.server --directory site          # and open the address that it prints
 
-ONNX Runtime Web (WebAssembly, or WebGPU: `?provider=webgpu`) moves the garments that come with the library, three.js
-skins the body on the GPU and draws. It needs Node with npm, which fetches what `package.json` names.
+ONNX Runtime Web (WebAssembly, or WebGPU: `?provider=webgpu`) moves the garments, three.js skins the body on the GPU and
+draws. It needs Node with npm, which fetches the packages that `package.json` names.
 """
 
-import argparse
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from clothjax.cli import fail_clearly, setup
+from clothjax import cli
 from clothjax.export import onnx
 from clothjax.files import storage
 from clothjax.progress import progress_bar
@@ -32,16 +31,19 @@ INFLUENCES = 4  # joints that move a vertex of the body: what GPU skinning takes
 
 
 def main(argv: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = cli.Parser("experiments.web.build", __doc__)
+    cli.model_argument(parser, nargs="*", about="; several; default: every one that comes with it")
     parser.add_argument("--out", type=Path, required=True, help="a folder")
-    parser.add_argument("--garments", nargs="+", choices=trained.shipped(), default=trained.shipped())
     parser.add_argument("--motions", nargs="+", default=MOTIONS, help="asset names or paths")
     arguments = parser.parse_args(argv)
     if shutil.which("npm") is None:
         raise ValueError("npm is not on the path: install Node")
     for folder in ("garments", "motions"):
         (arguments.out / folder).mkdir(parents=True, exist_ok=True)
-    models = {name: inference.load(name) for name in arguments.garments}
+    names = arguments.model or trained.shipped()
+    models = {Path(name).resolve().name: inference.load(cli.model_folder(name)) for name in names}
+    if len(models) < len(names):
+        raise ValueError(f"two models have one name: {', '.join(names)}; rename one")
     first, *others = models.values()
     if any(model.config.body != first.config.body for model in others):
         raise ValueError(f"{', '.join(models)} are not all of one body: leave some out")
@@ -60,7 +62,7 @@ def main(argv: list[str]) -> None:
         place = clip.translation - clip.translation[:1] * [1, 0, 1]
         rows = np.concatenate([np.reshape(clip.rotations, (len(place), -1)), place], axis=1)
         rows.astype("<f4").tofile(arguments.out / "motions" / f"{name}.bin")
-    about |= {"garments": list(arguments.garments), "motions": list(clips), "fps": first.config.fps}
+    about |= {"garments": list(models), "motions": list(clips), "fps": first.config.fps}
     about |= {"skin": ray_cast.SKIN, "cloth": ray_cast.CLOTH}
     (arguments.out / "about.json").write_text(json.dumps(about))
     bundle(arguments.out)
@@ -109,6 +111,4 @@ def _run(command: list[str], folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    setup()
-    with fail_clearly():
-        main(sys.argv[1:])
+    cli.run(main)

@@ -56,7 +56,7 @@ def test_underscores_in_an_option_get_its_new_name(monkeypatch, capsys):
     with pytest.raises(SystemExit) as end:
         program.run(bvh.main, bvh.Arguments, bvh.__doc__)
     assert end.value.code == 1
-    assert capsys.readouterr().err.startswith("error: --drop_clavicles: write --drop-clavicles;")
+    assert capsys.readouterr().err.startswith("error: --drop_clavicles is now written --drop-clavicles")
 
 
 # Generated motions

@@ -237,8 +237,8 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     for more, said in (
         ({}, "either --template or --mesh"),
         ({"template": "skirt", "mesh": mesh}, "either --template or --mesh"),
-        ({"template": "skirt", "pin": "red"}, "--pin says something of a mesh"),
-        ({"template": "skirt", "loose": False}, "--loose says something of a mesh"),
+        ({"template": "skirt", "pin": "red"}, "--pin is an option of --mesh"),
+        ({"template": "skirt", "loose": False}, "--loose is an option of --mesh"),
         ({"template": "skirt", "vertices": 0}, "--vertices 0: 100 to 20000"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -183,7 +183,7 @@ def test_clips_of_yours_are_called_as_their_files(tmp_path):
 @pytest.fixture
 def viewer():
     pytest.importorskip("viser")
-    given = argparse.Namespace(garment="skirt", run=None, motions=None, host="127.0.0.1", port=8123, no_browser=True)
+    given = argparse.Namespace(model="skirt", motions=None, host="127.0.0.1", port=8123, no_browser=True)
     viewer = start(given)
     yield viewer
     viewer.server.stop()

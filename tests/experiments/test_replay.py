@@ -9,11 +9,12 @@ import pytest
 from samples import settings
 from toy import small
 
+from clothjax.commands import train
 from clothjax.config import Config, TuningConfig
 from clothjax.files import checkpoint, configuration
 from clothjax.simulation import assembly
 from clothjax.training import pipeline, stage1
-from experiments import replay, train
+from experiments import replay
 
 
 @pytest.mark.slow

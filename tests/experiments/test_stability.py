@@ -26,7 +26,7 @@ def test_a_careless_energy_is_found(monkeypatch):
     def careless(deviation, mass, timestep):
         return mass * jnp.linalg.norm(deviation, axis=-1) ** 2 / (2 * timestep * timestep)
 
-    monkeypatch.setattr(energies, "inertia", careless)
+    monkeypatch.setattr(physics, "inertia", careless)
     term = physics.count_nonfinite(2000)["inertia"]
     assert term["energy"] == 0 and term["gradient"] > 0
 

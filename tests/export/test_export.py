@@ -11,15 +11,15 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from samples import apart, random_model
+from samples import ROOT, apart, random_model
 from toy import small
 
 from clothjax.body import skinning
+from clothjax.commands import convert
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.runtime import inference, specialise
 from clothjax.types import Pose
-from experiments import convert
 
 
 def test_onnx_is_the_model_in_closed_loop(model, motion, tmp_path):
@@ -179,7 +179,7 @@ def test_an_old_runtime_agrees_over_300_frames(int8, model, tmp_path):
 def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
     subprocess.run(["npm", "install", "--silent", "onnxruntime-web"], check=True, cwd=tmp_path)
     for name in ("psi.mjs", "garment.mjs"):
-        shutil.copy(Path(convert.__file__).parent / "deploy" / name, tmp_path)
+        shutil.copy(ROOT / "experiments" / "deploy" / name, tmp_path)
     motion = convert.validation(model)
     rotations = np.asarray(motion.rotations).reshape(len(motion.rotations), -1)
     given = {"rotations": rotations.tolist(), "translation": motion.translation.tolist()}
@@ -205,7 +205,7 @@ def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
     got = subprocess.run(["go", "mod", "download", "-json", module], check=True, capture_output=True, text=True)
     (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
     (tmp_path / "libonnxruntime.so.1").symlink_to(library)
-    source = Path(convert.__file__).parent / "deploy" / "play_onnx.c"
+    source = ROOT / "experiments" / "deploy" / "play_onnx.c"
     command = [native.compiler(), "-std=c99", "-O2", "-Wall", "-Werror", "-isystem", json.loads(got.stdout)["Dir"]]
     program = tmp_path / "play_onnx"
     command += [source, tmp_path / "libonnxruntime.so.1", f"-Wl,-rpath,{tmp_path}", "-o", program]
@@ -230,12 +230,12 @@ def test_litert_agrees_over_300_frames(model, tmp_path):
     """In an environment of its own, as its module says: TensorFlow wants older packages."""
     venv.create(tmp_path / "tf", with_pip=True)
     python = tmp_path / "tf" / "bin" / "python"
-    root = Path(convert.__file__).parents[1]
+    root = ROOT
     packages = (f"{root}[export]", "tensorflow-cpu", "ai-edge-litert")
     subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
     for int8, most in (((), 0.1), (("--int8",), 2.0)):
         out = tmp_path / "t.tflite"
-        command = [python, "-m", "experiments.convert", "--pretrained", "tshirt", "--to", "litert", "--out", out, *int8]
+        command = [python, "-m", "clothjax", "convert", "tshirt", "--to", "litert", "--out", out, *int8]
         subprocess.run(command, check=True, cwd=root)
         told = json.loads(out.with_suffix(".json").read_text())
         assert told["distance_to_jax"]["frames"] == 300 and 0 < told["distance_to_jax"]["max_mm"] < most
@@ -263,16 +263,14 @@ def test_safetensors_hold_the_whole_model(model, motion, tmp_path, monkeypatch):
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 40)
     out = tmp_path / "s.onnx"
-    convert.main(["--pretrained", "skirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
+    convert.main(["skirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
     told = json.loads(out.with_suffix(".json").read_text())
     assert told["betas"] == [1.0] and 0 < told["distance_to_jax"]["mean_mm"] < 1
-    assert "over 40 frames of closed loop" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="is of ONNX and LiteRT, not of stablehlo"):
-        convert.main(["--pretrained", "skirt", "--to", "stablehlo", "--int8"])
-    with pytest.raises(ValueError, match="are of ONNX, not of c"):
-        convert.main(["--pretrained", "skirt", "--to", "c", "--batch", "3"])
-    with pytest.raises(ValueError, match="give the folder of a run, or --pretrained"):
-        convert.main([])
+    assert "over 40 frames of autoregressive rollout" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="is of onnx and litert, not of stablehlo"):
+        convert.main(["skirt", "--to", "stablehlo", "--int8"])
+    with pytest.raises(ValueError, match="is of onnx, not of c"):
+        convert.main(["skirt", "--to", "c", "--batch", "3"])
 
 
 def test_what_is_not_installed_is_said(model, monkeypatch, tmp_path):

@@ -4,22 +4,21 @@ import dataclasses
 import os
 import shutil
 import subprocess
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from samples import apart, random_model
+from samples import ROOT, apart, random_model
 
 import clothjax as cj
+from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
 from clothjax.runtime import inference, specialise
 from clothjax.types import Pose
-from experiments import convert
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
-PLAY = Path(convert.__file__).parent / "deploy" / "play.c"
+PLAY = ROOT / "experiments" / "deploy" / "play.c"
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
@@ -173,8 +172,8 @@ def frames(motion, path, count):
 def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 20)
     out = tmp_path / "engine" / "skirt.psi"
-    convert.main(["--pretrained", "skirt", "--to", "c", "--out", str(out)])
-    assert "over 20 frames of closed loop" in capsys.readouterr().out
+    convert.main(["skirt", "--to", "c", "--out", str(out)])
+    assert "over 20 frames of autoregressive rollout" in capsys.readouterr().out
     shutil.copy(PLAY, out.parent)
     program = out.parent / "play"
     command = [

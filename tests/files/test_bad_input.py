@@ -494,7 +494,7 @@ def a_model_that_would_run_something(folder):
 
 @case("coat", "skirt")
 def a_garment_that_does_not_come_with_the_library(folder):
-    return lambda: render.main(["--pretrained", "coat", "--out", str(folder / "a.webp")])
+    return lambda: render.main(["coat", "--out", str(folder / "a.webp")])
 
 
 @case("run", "train first")
@@ -558,22 +558,22 @@ def betas_of_another_body(folder):
 
 @case("--betas", "10")
 def betas_of_another_body_to_convert(folder):
-    return lambda: convert.main(["--pretrained", "skirt", "--betas", *"123456789012", "--out", str(folder / "a.onnx")])
+    return lambda: convert.main(["skirt", "--betas", *"123456789012", "--out", str(folder / "a.onnx")])
 
 
 @case(r"a\.gif", "cannot write '.gif'", "webp")
 def a_picture_of_an_unknown_kind(folder):
-    return lambda: render.main(["--pretrained", "skirt", "--out", str(folder / "a.gif")])
+    return lambda: render.main(["skirt", "--out", str(folder / "a.gif")])
 
 
-@case("folder of a run, or --pretrained")
-def nothing_to_draw(folder):
-    return lambda: render.main(["--out", str(folder / "a.webp")])
+@case("--pretrained", "RUN_OR_NAME")
+def a_model_named_as_it_once_was(folder):
+    return lambda: render.main(["--pretrained", "skirt", "--out", str(folder / "a.webp")])
 
 
 @case("walk_3 has frames 1 to", "not 100000")
 def a_frame_after_the_end(folder):
-    return lambda: gallery.main(["--pretrained", "skirt", "--frame", "100000", "--out", str(folder / "a.png")])
+    return lambda: gallery.main(["skirt", "--frame", "100000", "--out", str(folder / "a.png")])
 
 
 @case("coat", "skirt|no such")

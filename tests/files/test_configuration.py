@@ -187,8 +187,9 @@ def test_mistaken_overrides_end_with_a_message(tmp_path, capsys, overrides, said
 def test_command_line(tmp_path, capsys):
     path = write(tmp_path, "c.yaml", "train: {steps: 5}\n")
     assert configuration.cli(Config, [str(path), "--name", "x"]) == Config(name="x", train=Train(steps=5))
-    with pytest.raises(SystemExit, match="first argument must be a configuration file"):
+    with pytest.raises(SystemExit, match="give a configuration file, settings, or both"):
         configuration.cli(Config, [])
+    assert configuration.cli(Config, ["--train.steps", "7"]) == Config(train=Train(steps=7))
     with pytest.raises(SystemExit, match=r"nowhere\.yaml: cannot be read"):
         configuration.cli(Config, ["nowhere.yaml"])
     with pytest.raises(SystemExit) as stop:
@@ -215,7 +216,7 @@ def test_the_vertices_that_a_stack_reaches(edges, level):
 @pytest.mark.parametrize(
     "section, name, value",
     [(cls, name, value) for cls in SECTIONS for name, value in cls.RETIRED.items()],
-    ids=lambda part: getattr(part, "__name__", str(part)),
+    ids=lambda part: getattr(part, "__name__", part if isinstance(part, str) else "value"),
 )
 def test_a_retired_setting_is_read_with_its_last_value_and_refused_with_another(section, name, value):
     old = 7.0 if value is config_module.ANYTHING else value

@@ -1,12 +1,15 @@
 """What the documents tell users to type works: the blocks of code in them are run, but for what cannot be had here."""
 
+import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
+import zipfile
 
 import pytest
-from samples import ROOT, SMALL, blocks, commands, run
+from samples import ROOT, SMALL, blocks, commands, run, sentences
 
 from clothjax.files import storage
 
@@ -37,10 +40,35 @@ def test_the_documents_have_blocks_and_name_what_is_there():
             assert all((ROOT / word).is_file() for word in rest if word.startswith("configs/")), command
 
 
+def test_documents_are_in_short_sentences():
+    found = [path for path in ROOT.rglob("*.md") if not {".venv", ".venv-ci", "node_modules"} & set(path.parts)]
+    assert len(found) > 20 and len((ROOT / "README.md").read_text().splitlines()) <= 130
+    for path in found:
+        for sentence in sentences(path.read_text()):
+            assert len(sentence.split()) <= 30, f"{path}: {sentence}"
+    assert sentences("One two. Three\nfour.\n\n| a | b |\n- Five.") == ["One two.", "Three four.", "- Five."]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name, code", blocks("python"))
-def test_python(name, code, workplace):
-    run([sys.executable, "-c", code], workplace)
+def test_python_from_the_wheel_alone(name, code, wheel, tmp_path):
+    for setting, short in (("steps", 20), ("sequences", 2)):
+        code = re.sub(rf'"{setting}": \d+', f'"{setting}": {short}', code)
+    environment = os.environ | {"PYTHONPATH": str(wheel)}
+    code = f"import clothjax; assert clothjax.__file__.startswith({str(wheel)!r})\n" + code
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A folder with what a wheel installs."""
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder / "dist"), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    with zipfile.ZipFile(next((folder / "dist").glob("*.whl"))) as file:
+        file.extractall(folder / "installed")
+    return folder / "installed"
 
 
 @pytest.mark.slow
@@ -51,7 +79,7 @@ def test_commands(workplace):
             continue
         for pattern, short in SHORT:
             command = re.sub(pattern, short, command)
-        if "experiments.train" in command or "experiments.sweep" in command:
+        if "experiments.train" in command or "clothjax train" in command or "experiments.sweep" in command:
             command += " " + SMALL
         program, *rest = shlex.split(command)
         print(command, flush=True)

@@ -272,8 +272,8 @@ def test_a_flag_goes_all_the_way(tmp_path):
     pipeline.train(config, tmp_path)
     report = evaluate(tmp_path)["evaluation"]
     assert report["psi"]["finite"] and "penetration_percent" not in report["psi"]
-    render.main([str(tmp_path), "--motion", "walk_3", "--out", str(tmp_path / "flag.webp"), "--frames", "3"])
-    render.main([str(tmp_path), "--motion", "walk_3", "--out", str(tmp_path / "flag.glb"), "--frames", "3"])
+    render.main([str(tmp_path), "--motions", "walk_3", "--out", str(tmp_path / "flag.webp"), "--frames", "3"])
+    render.main([str(tmp_path), "--motions", "walk_3", "--out", str(tmp_path / "flag.glb"), "--frames", "3"])
     model = inference.load(tmp_path)
     clip = storage.load_motion("walk_3", assembly.assemble(config).names)
     clip = Motion(clip.rotations[:20], clip.translation[:20].astype(np.float32), clip.fps)

@@ -1,0 +1,84 @@
+"""Writes Psi of a run, or a garment that comes with the library, for another runtime, and compares the two there.
+
+    python -m clothjax convert runs/quickstart --to onnx --int8
+    python -m clothjax convert skirt --to stablehlo --out skirt.stablehlo
+    python -m clothjax convert dress --to c --out engine/dress.psi
+    python -m clothjax convert tshirt --to onnx --batch dynamic --blendshapes 192 --betas 1 0 -0.5
+
+    onnx          ONNX Runtime 1.15 and newer, and engines built on it; for eight bits, --int8; to skin the garment in
+                  the engine, --output canonical; for a garment that nobody sees, --output none
+    stablehlo     any process with jax or XLA, on CPU, GPU or TPU, without clothjax
+    litert        LiteRT (TensorFlow Lite), as on phones; for eight bits, --int8
+    c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
+    safetensors   the arrays alone, for whoever builds a runtime
+
+A JSON beside the file tells how it is driven. The model is specialised first (`clothjax/runtime/specialise.py`).
+The distance of vertices to jax's unspecialised model over a rollout of 300 frames is printed and written to the JSON.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from clothjax import cli
+from clothjax.export import formats
+from clothjax.export.formats import FORMATS, Options
+from clothjax.files import storage
+from clothjax.runtime import inference, trained
+from clothjax.runtime.inference import Model
+from clothjax.simulation import assembly
+from clothjax.types import Material, Motion
+
+FRAMES = 300
+
+
+def main(argv: list[str]) -> None:
+    parser = cli.Parser("clothjax convert", __doc__)
+    cli.model_argument(parser)
+    parser.add_argument("--to", choices=FORMATS, default="onnx")
+    parser.add_argument("--out", type=Path, default=None, help="default: GARMENT.onnx and so on, in the run's folder")
+    parser.add_argument("--int8", action="store_true", help="eight bits")
+    parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
+    parser.add_argument("--output", choices=["world", "canonical", "none"], default="world", help="of the vertices")
+    parser.add_argument("--blendshapes", type=int, default=None, help="so many at the most; default: all")
+    parser.add_argument("--max-influences", type=int, default=None, help="joints that move a vertex; default: all")
+    parser.add_argument("--betas", type=float, nargs="+", default=None, help="of the body; default: the mean body")
+    parser.add_argument("--material", type=float, nargs=4, default=None, metavar=Material._fields)
+    arguments = parser.parse_args(argv)
+    options = Options(**{name: getattr(arguments, name) for name in Options._fields})
+    formats.check(arguments.to, options)
+    run = cli.model_folder(arguments.model)
+    betas = None
+    if arguments.betas is not None:
+        count = storage.load_body(trained.psi(run)[0].body).shapedirs.shape[-1]
+        if len(arguments.betas) > count:
+            raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
+        betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
+    material = None if arguments.material is None else Material(*arguments.material)
+    model = inference.load(run, betas=betas, material=material)
+    form = FORMATS[arguments.to]
+    shipped = arguments.model in trained.shipped()
+    out = arguments.out or (Path(".") if shipped else run) / f"{model.config.garment}.{form.suffix}"
+    about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
+    error = formats.export(model, arguments.to, out, options, about, _validation(model))
+    print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
+    if error is None:
+        print(f"not compared: {form.unrun}")
+    else:
+        print(
+            f"over {error['frames']} frames of autoregressive rollout: {error['mean_mm']:.4f} mm on average, "
+            f"{error['max_mm']:.4f} at most"
+        )
+
+
+def _batch(given: str) -> int | None:
+    """Characters a call, None for any number."""
+    return None if given == "dynamic" else int(given)
+
+
+def _validation(model: Model) -> Motion:
+    """The first validation motion that is here, for FRAMES frames."""
+    names = [name for name in model.config.evaluation.motions if storage.asset(name).is_file()]
+    clip = storage.load_motion(names[0] if names else "walk_3", model.names)
+    clip = assembly.there_and_back(clip, FRAMES)
+    return Motion(clip.rotations, np.asarray(clip.translation - clip.translation[:1], np.float32), clip.fps)

@@ -1,0 +1,51 @@
+"""Pictures and animations of a trained garment.
+
+    python -m clothjax render runs/quickstart --motions walk_3 --out walk.webp
+    python -m clothjax render runs/quickstart --motions walk_3 --out comparison.png
+    python -m clothjax render skirt --motions dance_3 --out skirt.mp4
+    python -m clothjax render skirt --motions walk_3 dance_3 --out skirt.usdc     # skirt_walk_3.usdc and so on
+
+Psi on the body as a film (.webp, .mp4); for a viewer or an animation program with both as meshes (.glb, .usdc, .usda,
+or .obj, of which each frame is a file of its own) or the garment's vertices alone (.pc2, .mdd, with an .obj of the mesh
+to put them on). .png compares skinning, Phi, Psi and the reference solver on a clip that `clothjax evaluate` has
+measured. Of several motions each has a file of its own.
+"""
+
+from pathlib import Path
+
+from clothjax import cli
+from clothjax.evaluation.pictures import WRITERS, perform, write_comparison
+from clothjax.evaluation.rollouts import load_run
+
+
+def main(argv: list[str]) -> None:
+    parser = cli.Parser("clothjax render", __doc__)
+    cli.model_argument(parser)
+    parser.add_argument(
+        "--motions", nargs="+", default=None, help="asset names or paths; default: the first configured one"
+    )
+    parser.add_argument("--out", type=Path, required=True, help=f"a file of .png, {', '.join(WRITERS)}")
+    parser.add_argument("--frames", type=int, default=None, help="at the most; default: the configured number")
+    arguments = parser.parse_args(argv)
+    kind = arguments.out.suffix
+    if kind != ".png" and kind not in WRITERS:
+        raise ValueError(f"{arguments.out}: cannot write {kind!r}; allowed: .png, {', '.join(WRITERS)}")
+    run = cli.model_folder(arguments.model)
+    experiment, _ = load_run(run)
+    motions = arguments.motions or experiment.config.evaluation.motions[:1]
+    frames = arguments.frames or experiment.config.evaluation.animation_frames
+    outs = {motion: _out(arguments.out, motion if len(motions) > 1 else None) for motion in motions}
+    if len(set(outs.values())) < len(motions):
+        raise ValueError(f"two motions have one name: {', '.join(motions)}; rename one")
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    for motion, out in outs.items():
+        if kind == ".png":
+            write_comparison(run, experiment, motion, out)
+        else:
+            WRITERS[kind](out, perform(run, experiment, motion, frames))
+        print(f"written to {out.with_name(f'{out.stem}_NNNN.obj') if kind == '.obj' else out}")
+
+
+def _out(given: Path, motion: str | None) -> Path:
+    """The file of a motion, None where it is the only one."""
+    return given if motion is None else given.with_name(f"{given.stem}_{Path(motion).stem}{given.suffix}")

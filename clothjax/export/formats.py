@@ -1,0 +1,123 @@
+"""Every format that a model is exported to: how it is written, and run again to be compared."""
+
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from clothjax.export import litert, native, onnx, safetensors, stablehlo
+from clothjax.runtime import inference, specialise
+from clothjax.runtime.inference import Model
+from clothjax.types import Motion
+
+
+class Options(NamedTuple):
+    """Choices that a format may have; a format refuses those that are not its own."""
+
+    int8: bool = False
+    batch: int | None = 1  # characters a call, None for any number
+    output: str = "world"  # or "canonical", "none": what is computed of the vertices
+    blendshapes: int | None = None  # so many at the most; None: all
+    max_influences: int | None = None  # joints that move a vertex, at the most; None: all
+
+
+class Format(NamedTuple):
+    """How a format is written and run."""
+
+    suffix: str
+    write: Callable[[Model, Path, Options, dict], Any]  # with what its JSON says about the model
+    run: Callable[[Path, Model, Motion, Options], np.ndarray | None]  # [T, V, 3] m; None: it cannot be run here
+    options: tuple[str, ...] = ()  # of those that not every format has
+    described: bool = True  # whether a JSON beside the file tells how it is driven
+    unrun: str = ""  # why it cannot be run, where it is not
+
+
+def _run_onnx(path: Path, model: Model, motion: Motion, options: Options) -> np.ndarray | None:
+    return onnx.run_onnx(path, model, motion) if options.output == "world" else None
+
+
+def _write_litert(model: Model, path: Path, options: Options, about: dict) -> None:
+    model = specialise.evened(model) if options.int8 else model
+    litert.to_litert(model, path, int8=options.int8, about=about)
+
+
+def _run_c(path: Path, model: Model, motion: Motion, options: Options) -> np.ndarray | None:
+    if native.compiler() is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        return native.run_c(native.build(folder), path, motion)
+
+
+FORMATS = {
+    "onnx": Format(
+        "onnx",
+        lambda model, path, o, about: onnx.to_onnx(
+            model, path, batch=o.batch, int8=o.int8, output=o.output, about=about
+        ),
+        _run_onnx,
+        ("int8", "batch", "output"),
+        unrun="its vertices are not in the world",
+    ),
+    "stablehlo": Format(
+        "stablehlo",
+        lambda model, path, _, about: stablehlo.to_stablehlo(model, path, about),
+        lambda path, model, motion, _: stablehlo.run_stablehlo(path, model, motion),
+    ),
+    "litert": Format(
+        "tflite", _write_litert, lambda path, model, motion, _: litert.run_litert(path, model, motion), ("int8",)
+    ),
+    "c": Format(
+        "psi", lambda model, path, _, about: native.to_c(model, path, about), _run_c, unrun="there is no C compiler"
+    ),
+    "safetensors": Format(
+        "safetensors",
+        lambda model, path, *_: safetensors.to_safetensors(model, path),
+        lambda path, model, motion, _: np.asarray(inference.animate(safetensors.from_safetensors(path), motion)[0]),
+        described=False,
+    ),
+}  # by the name that a user gives
+
+
+def check(name: str, options: Options) -> None:
+    """Refuses options that are not of a format.
+
+    Raises:
+        ValueError: for such an option, with the formats that it is of.
+    """
+    for option in ("int8", "batch", "output"):
+        chosen = getattr(options, option) != getattr(Options(), option)
+        if chosen and option not in FORMATS[name].options:
+            of = " and ".join(each for each, form in FORMATS.items() if option in form.options)
+            raise ValueError(f"--{option} is of {of}, not of {name}")
+
+
+def export(model: Model, name: str, out: Path, options: Options, about: dict, motion: Motion) -> dict | None:
+    """Writes a specialised model, with its JSON, and compares it to jax's unspecialised one.
+
+    Args:
+        name: of the format.
+        about: of the model, for the JSON.
+        motion: to compare over.
+
+    Returns:
+        The `frames` of the rollout, and the mean and maximal distance of vertices, `mean_mm` and `max_mm`; None where
+        the file cannot be run here.
+    """
+    check(name, options)
+    form = FORMATS[name]
+    small = specialise.specialise(model, blendshapes=options.blendshapes, max_influences=options.max_influences)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    form.write(small, out, options, about)
+    vertices = form.run(out, small, motion, options)
+    if vertices is None:
+        return None
+    apart = 1e3 * np.linalg.norm(vertices - np.asarray(inference.animate(model, motion)[0]), axis=-1)
+    error = {"frames": len(vertices), "mean_mm": float(apart.mean()), "max_mm": float(apart.max())}
+    description = out.with_suffix(".json")
+    if form.described and description.is_file():
+        told = json.loads(description.read_text())
+        description.write_text(json.dumps(told | {"distance_to_jax": error}))
+    return error
