@@ -213,10 +213,10 @@ class Player:
         """
         clips, dt = self.clips, 1.0 / self.clips.fps
         velocity = np.asarray(velocity, np.float64)
-        if facing is None:
-            walks = np.linalg.norm(velocity) > 0.1
-            facing = float(np.arctan2(velocity[0], velocity[1])) if walks else self.heading
-        off = (facing - self.heading + np.pi) % (2 * np.pi) - np.pi
+        heading = self.heading if facing is None else facing
+        if facing is None and np.linalg.norm(velocity) > 0.1:
+            heading = np.arctan2(velocity[0], velocity[1])
+        off = (heading - self.heading + np.pi) % (2 * np.pi) - np.pi
         allowed = self._allowed(family)
         self._since += 1
         ended = clips.left[self._now] == 0
