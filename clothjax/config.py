@@ -3,21 +3,22 @@
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-# what joints from the wrists on are called, in lower case, by CMU and by SMPL
+# parts of the names, in lower case, of joints from the wrists on in CMU and SMPL
 HANDS = ("hand", "finger", "thumb", "wrist", "index", "middle", "pinky", "ring")
 
 
-ANYTHING = object()  # of a retired setting: whatever it was, it is no longer read
+ANYTHING = object()  # any value of a retired setting, which is no longer read
 
 
 def _require(condition: bool, message: str) -> None:
+    """Raise a ValueError with `message` unless the condition holds."""
     if not condition:
         raise ValueError(message)
 
 
 @dataclass(frozen=True)
 class Range:
-    """Where a material constant is drawn from in training, and how the networks see it: scaled to [0, 1]."""
+    """The range of a material constant in training; the networks see the constant scaled to [0, 1] over it."""
 
     low: float
     high: float
@@ -30,7 +31,7 @@ class Range:
 
 @dataclass(frozen=True)
 class MaterialConfig:
-    """The cloth. `ranges` are trained over (the thesis's), the single values are what evaluation uses (HOOD's)."""
+    """The cloth. Training draws from the ranges (the thesis's), evaluation uses the single values (HOOD's)."""
 
     density: float = 0.20022  # kg/m^2
     mu: float = 23600.0  # Pa
@@ -46,29 +47,30 @@ class MaterialConfig:
 
 @dataclass(frozen=True)
 class PhysicsConfig:
-    """What acts on the cloth, and the constants that do not belong to it.
+    """The forces on the cloth, and their constants.
 
-    What is not there is not in the compiled programs either: training, Phi and the reference solver alike.
+    The compiled programs of training, Phi and the reference solver leave out the terms that a scene does not have.
     """
 
     body: Literal["moving", "still", "none"] = "moving"
-    """Whether there is a body to touch, and whether it moves. Where there is none, the rig only carries the pins."""
+    """The body that the cloth can touch; it moves, stands still or does not exist. Without one, the rig only carries
+    the pins."""
     without: tuple[Literal["bending", "gravity", "friction"], ...] = ()
     """Energies that the scene does not have."""
     collision_stiffness: float = 1e5  # J/m^3, of the cubic penetration
     collision_offset: float = 3e-3  # m
     friction_coefficient: float = 0.5
     shaped_rest: bool = True
-    """The rest shape follows the wearer's betas (a graded garment); false: always the template, as in HOOD."""
+    """The rest shape follows the character's betas (a graded garment); false: always the template, as in HOOD."""
     contact_surface: Literal["triangles", "centroids"] = "triangles"
-    """What a garment vertex can touch: the body's nearest triangle; or the plane of the face whose centroid is
-    nearest, as in HOOD."""
+    """The surface that a garment vertex can touch: the body's nearest triangle; or the plane of the face with the
+    nearest centroid, as in HOOD."""
     edge_contact: bool = True
     """Edges of the garment touch the body between their ends too, so that a limb does not slip through. Triangles only.
     """
     self_contact: bool = False
-    """Vertices of the garment keep away from its triangles."""
-    self_offset: float = 2e-3  # m, the distance that they keep
+    """Vertices of the garment keep a distance from its triangles."""
+    self_offset: float = 2e-3  # m, that distance
     reach: float = 0.6  # m, body farther than this from the garment at rest is never searched
 
     RETIRED: ClassVar[dict[str, Any]] = {"friction_radius": 3e-3, "friction_smoothing": 1e-4, "flat_hinges": True}
@@ -96,7 +98,7 @@ class Ramp:
 
     @property
     def absent(self) -> bool:
-        """Whether the term is never there, so that it can be left out of the program."""
+        """True if the weight is always zero, so that programs can leave the term out."""
         return self.start == 0 and not self.end
 
 
@@ -117,14 +119,14 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class Stack:
-    """Message-passing blocks in a row on the same edge sets: `mesh` and `coarse0`, `coarse1`, ..."""
+    """Consecutive message-passing blocks on the same edge sets: `mesh` and `coarse0`, `coarse1`, ..."""
 
     edges: tuple[str, ...]
     blocks: int
 
     @property
     def lowest_level(self) -> int:
-        """Of the vertices that have edges in it: 0 with the fine mesh, else one more than its finest coarse level."""
+        """Lowest vertex level that this stack touches: 0 = fine mesh, i + 1 = coarse level i."""
         return min(0 if name == "mesh" else 1 + int(name.removeprefix("coarse")) for name in self.edges)
 
 
@@ -133,7 +135,8 @@ class Level:
     """One mesh-convolution block."""
 
     features: int | None = None
-    """Channels it gives; null, for the last one: as many as the latent size asks for, with no layer after it."""
+    """Output channels. Null, allowed for the last block: the number that gives the latent size, with no layer after it.
+    """
     stride: int = 2
     radius: int = 2
 
@@ -147,27 +150,28 @@ class ModelConfig:
     """Linear layers of every encoder and processor MLP."""
     processor: tuple[Stack, ...] = (Stack(("mesh", "coarse1"), 4),)
     body_nodes: Literal["updated", "encoded"] = "encoded"
-    """Whether body nodes take part in message passing, or only send their encoding to the garment."""
+    """Body nodes take part in message passing (`updated`), or only send their encoding to the garment (`encoded`)."""
     canonical_features: bool = True
-    """Adds, to HOOD's features, the state seen from the canonical pose at the next frame."""
+    """Add the state, seen from the canonical pose at the next frame, to HOOD's features."""
     convolution: tuple[Level, ...] = (Level(64), Level(64))
     convolution_bases: int = 8
     latent: int = 400
-    """Wanted size L; the real one is the nearest multiple of the vertices left by the convolution."""
+    """Target size L; the actual one is the nearest multiple of the number of vertices after the convolution."""
     latent_update: Literal["absolute", "descent"] = "descent"
-    """Whether the network gives Z as in the thesis, or what is missing from a guess: the current frame's Z, and
-    its last change where that helps, after some steps down the potential of the garment that it decodes to."""
+    """The output of the network: Z as in the thesis (`absolute`), or the correction of a guess (`descent`). The guess
+    is the current frame's Z, plus its last change where that helps, after some steps down the potential."""
     descent_steps: int = 16
     """Conjugate-gradient steps of the guess."""
     descent_samples: int = 24
-    """Closed loops at whose ends the Hessian is taken whose mean preconditions the steps; 0: only that at rest."""
+    """Autoregressive rollouts at whose ends the Hessian is evaluated; its mean preconditions the steps. 0: only the
+    Hessian at rest."""
     descent_damping: float = 0.02
     """J, added to the Hessian of unit codes: folds are stiffer than its mean."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
     decoder_skip: bool = True
-    """Adds a linear map of Z to the decoder's output, which the thesis has not. Narrow ReLU layers alone leave the
-    blend-shape weights few directions to move in."""
+    """Add a linear map of Z to the decoder's output, unlike the thesis. Narrow ReLU layers alone leave the blend-shape
+    weights few directions to move in."""
     blendshapes: int = 384
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
@@ -198,10 +202,11 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class ShapesConfig:
-    """The cloth whose principal components the blend shapes start from: moved by the physics, all vertices free."""
+    """The simulations whose principal components are the first blend shapes: pure physics, all vertices free."""
 
     sequences: int = 44
-    """Closed loops, each of its own clip, betas and material; 0: smooth shapes, eigenvectors of the Laplacian."""
+    """Autoregressive rollouts, each of its own clip, betas and material. 0: smooth shapes, eigenvectors of the
+    Laplacian."""
     frames: int = 60
     descent_steps: int = 30
     """Conjugate-gradient steps of a frame."""
@@ -221,21 +226,21 @@ class PhysicsTrainingConfig:
     """Persistent simulations; `restart_probability: 1` with any pool is HOOD's restart curriculum."""
     restart_probability: float = 1.0 / 90.0
     lost: float | None = None
-    """Loss from which on a simulation is begun anew at its next turn, as are those with a vertex 5 m from the root.
-    Null: only these; an untrained Phi needs the time to mend its own."""
+    """Loss from which on a simulation restarts at its next turn, like those with a vertex 5 m from the root. Null: only
+    the latter; an untrained Phi needs time to recover from its own errors."""
     rollout: int = 1
-    """Frames of one update at the start ..."""
+    """Frames of one update at the start."""
     rollout_end: int = 1
-    """... and at the most."""
+    """Most frames of one update."""
     rollout_every: int = 5000
     """Steps after which the rollout grows by one frame."""
     gradient_frames: int = 1
-    """Frames of a rollout that gradients go through: 1 is HOOD's way, every frame's input state a constant."""
+    """Frames of a rollout that gradients go through. As in HOOD, 1 makes every frame's input state a constant."""
     learning_rate: float = 1e-3
     decay_start: float = 0.4
-    """Fraction of the steps at full rate; then exponential decay ..."""
+    """Fraction of the steps at full rate, before exponential decay."""
     decay_end: float = 0.03
-    """... to this fraction of it."""
+    """Final learning rate as a fraction of the full one."""
     adam_b2: float = 0.99
     clip: float = 1.0
     ema: float = 0.995
@@ -252,8 +257,8 @@ class Stage1Config(PhysicsTrainingConfig):
 
     start_timestep: float = 1.0 / 3.0  # s, of the quasi-static first step (HOOD); 0: start as skinned
     blendshape_rate: float = 0.0
-    """Learning rate of the blend shapes, relative. 0 keeps those that they start from: principal shapes that were
-    trained on reach less of what the cloth does on new motions."""
+    """Learning rate of the blend shapes, relative. 0 keeps the first ones: after training, principal shapes represent
+    less of the cloth's motion on new clips."""
     betas: float = 2.0  # standard deviations, drawn uniformly from +-this
 
 
@@ -264,33 +269,35 @@ class TuningConfig(PhysicsTrainingConfig):
     steps: int = 0
     pool: int = 192
     lost: float | None = 1e4
-    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth that has gone into the body may come to 1e5 and stay there;
-    that which can come out should be seen doing so."""
+    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth inside the body may reach 1e5 and stay there. Training should
+    see cloth that can still come out do so."""
     learning_rate: float = 1.5e-4
     clip: float = 1.5
     """Less than nearly every gradient, so that simulations count alike: soft cloth, and cloth in the body."""
     preconditioning: float = 0.5
-    """Power of the matrices that gradients are multiplied by; 0: none.
+    """Power of the matrices that multiply gradients; 0: none.
 
-    They are Phi's inverse Hessian, where `model.latent_update` is `descent`, for gradients of codes, and the inverse
-    covariance of the poses for those of the first layer. The cloth is up to 4 000 times stiffer along some codes, in
-    standard deviations, than along others. With 1, errors of all would count alike, which energies do not."""
+    Gradients of codes get Phi's inverse Hessian if `model.latent_update` is `descent`. Those of the first layer get the
+    inverse covariance of the poses. In standard deviations, the cloth is up to 4 000 times stiffer along some codes
+    than along others. With 1, errors of all codes would count alike, unlike their energies."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"start_timestep": 0.0, "blendshape_rate": 0.0, "betas": ANYTHING}
 
 
 @dataclass(frozen=True)
 class PeerConfig:
-    """A baseline in the place of Phi and Psi (`clothjax/networks/baselines.py`), trained with the settings of stage 1.
-    Gradients pass through its memory over a whole rollout."""
+    """A baseline in place of Phi and Psi (`clothjax/networks/baselines.py`), trained with the settings of stage 1.
+
+    Gradients pass through its memory over a whole rollout.
+    """
 
     network: Literal["", "ncs", "snug", "direct"] = ""
-    """NCS, SNUG's recurrent network, or Psi itself trained directly on the physics: the thesis's ablation, with the
-    sizes of `model` and `stage2`."""
+    """NCS, SNUG's recurrent network, or Psi itself trained directly on the physics. The last is the thesis's ablation,
+    with the sizes of `model` and `stage2`."""
     width: int = 512
-    """Of the layers of NCS (512 as published) and of each of SNUG's four units (256)."""
+    """Width of the layers of NCS (512 as published) and of each of SNUG's four units (256)."""
     blendshapes: int = 512
-    """Of NCS."""
+    """Number of blend shapes of NCS."""
 
     def __post_init__(self):
         _require(self.width > 0 and self.blendshapes > 0, "peer: sizes must be > 0")
@@ -307,17 +314,18 @@ class Stage2Config:
     noise: float = 0.3
     """Standard deviation of the noise on the first Z of a rollout, in standard deviations of Z."""
     vertex_share: float = 0.8
-    """Of the loss, taken by the error of the decoded vertices; the rest is that of the code. Both are shares of a
-    variance, so that parts of the code that move nothing do not crowd out those that do."""
+    """Share of the decoded vertices' error in the loss; the rest is the code's. Both errors are fractions of a
+    variance, so that parts of the code that move nothing do not crowd out the others."""
     latent_decay: float = 0.1
-    """Part of Z forgotten in a frame unless the network gives it back: without it, the closed loop drifts."""
+    """Part of Z that decays in a frame unless the network restores it. Without it, the autoregressive rollout drifts.
+    """
     hidden: tuple[int, ...] = (512, 512)
     learning_rate: float = 1e-3
     clip: float = 1.0
     sequences: int = 96
-    """Teacher rollouts, each of its own betas and material ..."""
+    """Teacher rollouts, each of its own betas and material."""
     frames: int = 160
-    """... and this many frames."""
+    """Frames of each teacher rollout."""
     excluded_joints: tuple[str, ...] = (*HANDS, "toe", "jaw", "eye")
     """Joints whose names contain one of these, in upper or lower case, are not inputs."""
     seed: int = 0
@@ -327,23 +335,23 @@ class Stage2Config:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What `experiments.evaluate` runs on when it is told nothing else."""
+    """The defaults of `clothjax evaluate`."""
 
     motions: tuple[str, ...] = ("walk_3",)
     betas_seed: int = 12345
     betas: float = 1.5  # standard deviations
     frames: int = 300
-    """Of each motion, at the most."""
+    """Most frames of each motion."""
     gap_frames: int = 10
-    """Frames at which the reference solver is asked."""
+    """Frames at which the reference solver runs."""
     solver_frames: int = 60
-    """Frames of the reference solver's own closed loop, for jitter and pictures."""
+    """Frames of the reference solver's own rollout, for jitter and pictures."""
     long_frames: int = 1000
-    """Frames of the closed-loop test, the motion repeated."""
+    """Frames of the long autoregressive rollout, with the motion repeated."""
     wearers: bool = False
-    """Measures nine wearers too: a thin, the mean and a heavy body in soft, middling and stiff cloth."""
+    """Measure nine characters too: a thin, the mean and a heavy body in soft, middling and stiff cloth."""
     animation_frames: int = 120
-    """Frames of animations, at the most."""
+    """Most frames of an animation."""
 
 
 @dataclass(frozen=True)
@@ -353,7 +361,7 @@ class Config:
     garment: str = "tshirt_1000"
     body: str = "body"
     motions: tuple[str, ...] = ()
-    """Training motions: asset names or paths; empty: every embedded clip but those of `evaluation`."""
+    """Training motions: asset names or paths; empty: every embedded clip except those of `evaluation`."""
     fps: float = 30.0
     material: MaterialConfig = field(default_factory=MaterialConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
@@ -366,10 +374,10 @@ class Config:
     peer: PeerConfig = field(default_factory=PeerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     directory: str = ""
-    """Where the run is kept; empty: runs/<name of the config file>."""
+    """Folder of the run; empty: runs/<name of the config file>."""
 
     def __post_init__(self):
         _require(
             not self.peer.network or self.stage1.start_timestep == 0,
-            "a peer's network does not know the time step: set stage1.start_timestep to 0",
+            "a baseline (peer.network) does not know the time step: set stage1.start_timestep to 0",
         )

@@ -1,8 +1,8 @@
-"""Looks at an installation: versions, devices, assets, and which optional parts are there.
+"""Check an installation: versions, devices, assets and optional parts.
 
     python -m clothjax doctor
 
-It names what is missing for which command, and ends with 1 where clothjax cannot run.
+The report names the missing packages of each command. The exit status is 1 if clothjax cannot run.
 """
 
 import platform
@@ -24,7 +24,7 @@ COMMANDS = {
     "compare": "experiments.compare_solvers, XPBD in experiments.benchmark: beside NVIDIA Newton",
     "dev": "make test",
 }
-PROGRAMS = {  # by what they are: their names, and what needs them
+PROGRAMS = {  # kind -> names of the program, and its use
     "C": (("cc", "gcc", "clang"), "the plain C runtime"),
     "C++": (("c++", "g++", "clang++"), "jax that calls the plain C runtime"),
     "Node.js": (("npm",), "experiments.web, and its tests"),
@@ -33,14 +33,15 @@ PROGRAMS = {  # by what they are: their names, and what needs them
 
 
 def main(argv: list[str]) -> None:
-    cli.Parser("clothjax doctor", __doc__).parse_args(argv)
+    """Print the report, and exit with 1 if clothjax cannot run."""
+    cli.Parser("clothjax doctor", __doc__ or "").parse_args(argv)
     lines, sound = report()
     print("\n".join(lines))
     raise SystemExit(0 if sound else 1)
 
 
 def report() -> tuple[list[str], bool]:
-    """Lines for a person, and whether all is there that clothjax cannot do without."""
+    """Return the lines of the report, and whether clothjax can run."""
     lines = [f"clothjax {_version('clothjax')}, Python {platform.python_version()}, {platform.platform()}", ""]
     try:
         required, extras = requirements()
@@ -51,22 +52,22 @@ def report() -> tuple[list[str], bool]:
     if unmet:
         command = " ".join(f"'{wanted.name}{wanted.specifier}'" for wanted in unmet)
         return [*lines, "", f"broken: pip install {command}"], False
-    found, running = _devices()
-    lines += ["", found, ""]
+    devices, running = _devices()
+    lines += ["", devices, ""]
     for extra, wanted in extras.items():
         absent = [each.name for each in wanted if not _met(each)]
         state = f"without {', '.join(absent)}: pip install 'clothjax[{extra}]'" if absent else "ready"
         lines.append(f"  {extra:8} {state:60} {COMMANDS.get(extra, '')}".rstrip())
     for program, (names, use) in PROGRAMS.items():
-        found = next(filter(None, map(shutil.which, names)), None)
+        path = next(filter(None, map(shutil.which, names)), None)
         absent = f"no {' or '.join(names)} on the PATH"
-        lines.append(f"  {program:8} {found or absent:60} {use}")
+        lines.append(f"  {program:8} {path or absent:60} {use}")
     garments, sound = _garments()
     return [*lines, "", *garments], sound and running
 
 
 def requirements() -> tuple[list[Requirement], dict[str, list[Requirement]]]:
-    """The packages that clothjax needs, and those of each of its extras.
+    """List the packages that clothjax needs, and those of each of its extras.
 
     Raises:
         importlib.metadata.PackageNotFoundError: if clothjax is not installed.
@@ -80,6 +81,7 @@ def requirements() -> tuple[list[Requirement], dict[str, list[Requirement]]]:
 
 
 def _version(name: str) -> str | None:
+    """Return the version of an installed package, or None."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -87,27 +89,32 @@ def _version(name: str) -> str | None:
 
 
 def _met(wanted: Requirement) -> bool:
+    """Return whether a package is installed in a version that is enough."""
     version = _version(wanted.name)
     return version is not None and wanted.specifier.contains(version, prereleases=True)
 
 
 def _state(wanted: Requirement) -> str:
+    """Describe the version of a required package."""
     version = _version(wanted.name)
-    return version if _met(wanted) else f"{version}, not {wanted.specifier}" if version else "MISSING"
+    if version is None:
+        return "MISSING"
+    return version if _met(wanted) else f"{version}, not {wanted.specifier}"
 
 
 def _devices() -> tuple[str, bool]:
+    """Return a line about the devices of jax, and whether there are any."""
     import jax
 
     try:
-        found = [f"{device.platform} ({device.device_kind})" for device in jax.devices()]
+        devices = [f"{device.platform} ({device.device_kind})" for device in jax.devices()]
     except RuntimeError as error:
         return f"broken: jax finds no device: {error}", False
-    return f"jax runs on {', '.join(found)}", True
+    return f"jax runs on {', '.join(devices)}", True
 
 
 def _garments() -> tuple[list[str], bool]:
-    """Lines about the garments that come with the library, and whether they can be read."""
+    """Return lines about the garments that come with the library, and whether all of them can be read."""
     from clothjax.runtime import trained
 
     lines, sound = [], True

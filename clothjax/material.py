@@ -1,4 +1,4 @@
-"""The cloth: its configured constants, the ranges they are drawn from, and how networks see them."""
+"""The cloth: its configured constants, the ranges for sampling them, and their form as network inputs."""
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +8,13 @@ from clothjax.types import Array, Material
 
 
 def configured_material(config: Config) -> Material:
-    """The configured material."""
+    """Return the configured material."""
     cloth = config.material
     return Material(*(jnp.float32(value) for value in (cloth.density, cloth.mu, cloth.lam, cloth.bending)))
 
 
 def material_inputs(material: Material, config: MaterialConfig) -> Array:
-    """Bending, mu and lambda [3] scaled to [0, 1] over their training ranges (HOOD's order); [0] if they are fixed."""
+    """Return bending, mu and lambda [3] scaled to [0, 1] over their training ranges (HOOD's order); [0] if fixed."""
     if not config.sample:
         return jnp.zeros(0)
     pairs = (
@@ -25,8 +25,8 @@ def material_inputs(material: Material, config: MaterialConfig) -> Array:
     return jnp.stack([scaled(value, limits) for value, limits in pairs])
 
 
-def scaled(value: Array, limits) -> Array:
-    """A material constant on [0, 1] over its training range, logarithmic where the range is."""
+def scaled(value: Array, limits: Range) -> Array:
+    """Scale a material constant to [0, 1] over its training range, logarithmically if the range is logarithmic."""
     if limits.low == limits.high:
         return jnp.zeros_like(jnp.asarray(value))
     low, high = jnp.log(limits.low), jnp.log(limits.high)
@@ -35,15 +35,15 @@ def scaled(value: Array, limits) -> Array:
     return (value - limits.low) / (limits.high - limits.low)
 
 
-def unscaled(share: Array, limits) -> Array:
-    """The inverse of `scaled`."""
+def unscaled(share: Array, limits: Range) -> Array:
+    """Invert `scaled`."""
     if limits.log:
         return limits.low * (limits.high / limits.low) ** share
     return limits.low + share * (limits.high - limits.low)
 
 
 def sample_material(key: Array, config: Config) -> Material:
-    """A material from the training ranges, or the configured one."""
+    """Draw a material from the training ranges, or return the configured one if they are not used."""
     cloth = config.material
     if not cloth.sample:
         return configured_material(config)
@@ -55,4 +55,4 @@ def sample_material(key: Array, config: Config) -> Material:
         return limits.low + (limits.high - limits.low) * uniform
 
     ranges = (cloth.density_range, cloth.mu_range, cloth.lam_range, cloth.bending_range)
-    return Material(*(draw(k, limits) for k, limits in zip(jax.random.split(key, 4), ranges)))
+    return Material(*(draw(k, limits) for k, limits in zip(jax.random.split(key, 4), ranges, strict=True)))

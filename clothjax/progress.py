@@ -1,4 +1,4 @@
-"""Lines and progress bars for a person who waits."""
+"""Lines and progress bars on the terminal."""
 
 import contextlib
 import sys
@@ -10,14 +10,14 @@ from tqdm import tqdm
 
 
 def say(text: str) -> None:
-    """Prints a line, of several processes only in the first."""
+    """Print a line; of several processes only the first prints."""
     if jax.process_index() == 0:
         print(text, flush=True)
 
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A function to call with the amount done: a bar on a terminal, a line every ten seconds elsewhere."""
+    """Yield a function to call with the amount done: a bar on a terminal, a line every ten seconds elsewhere."""
     terminal = sys.stderr.isatty() and jax.process_index() == 0
     last = time.monotonic()
     with tqdm(total=total, desc=what, disable=not terminal, leave=False) as bar:

@@ -1,5 +1,10 @@
-"""What flows between the modules. Letters: V garment vertices, B body vertices, J joints, S betas, F faces,
-H hinges, E edges, T frames, L latent size, K blend shapes. SI units, +Y up."""
+"""Data types that flow between the modules. SI units, +Y up.
+
+Sizes: V garment vertices, B body vertices, J joints, S betas, F faces, H hinges, E edges, T frames, L latent size,
+K blend shapes.
+States: x positions [m], v velocities [m per frame], z latent code, dt timestep [s], hold persistence (the positions
+of a garment that keeps its canonical displacement), lbs plain skinning.
+"""
 
 from typing import NamedTuple
 
@@ -32,7 +37,7 @@ class Garment(NamedTuple):
     weights: Array  # [V, J] skinning weights, rows sum to 1
     shapedirs: Array  # [V, 3, S] m per standard deviation
     pinned: Array  # [V] bool, vertices that follow skinning
-    cloth: Array | None = None  # [V, 3] of the material's density, mu and lam, and bending: how many times as much here
+    cloth: Array | None = None  # [V, 3] factors of the material's density, of its mu and lam, and of its bending
 
 
 class Motion(NamedTuple):
@@ -95,11 +100,11 @@ class EdgeContact(NamedTuple):
 
 
 class SelfContact(NamedTuple):
-    """The place of the garment that each of its vertices may touch, frozen for one time step."""
+    """The point of the garment that each of its vertices may touch, frozen for one time step."""
 
     corners: Array  # [V, 3] int32 vertices of the triangle
     weights: Array  # [V, 3] barycentric coordinates
-    normal: Array  # [V, 3] from that place to the vertex
+    normal: Array  # [V, 3] from that point to the vertex
 
 
 class ClothState(NamedTuple):

@@ -1,1 +1,1 @@
-"""The wearer of a garment: rotations, skinning, motion clips, a player to steer it."""
+"""The character in a garment: rotations, skinning, motion clips, a player to steer it."""

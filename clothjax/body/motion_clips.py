@@ -11,29 +11,29 @@ from clothjax.types import Array, Motion, Pose
 
 
 class Clips(NamedTuple):
-    """Clips of N frames in all. Only steps of the root are kept: the scene has no place in the world."""
+    """Clips of N frames in all. Only steps of the root are stored: the scene has no place in the world."""
 
     rotations: Array  # [N, J, 3, 3]
     advance: Array  # [N, 3] m, translation of the next frame minus this one's; zero at a clip's end
-    remaining: Array  # [N] int32, steps that can be taken from a frame before an unusable one
+    remaining: Array  # [N] int32, steps from a frame on before an unusable one
     passed: Array  # [N] int32, the same backwards
     chance: Array  # [N] cumulative probability of starting at a frame
 
 
 def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequence[np.ndarray], shortest: int) -> Clips:
-    """Clips for training.
+    """Lay clips end to end, with the chance of starting at each frame.
 
     Args:
         motions: with the same joints and rate.
-        families: one name a motion; every family is started from equally often, however long its clips are.
+        families: one name a motion; every family gets equally many starts, however long its clips are.
         bad: frames of each motion that must not be in any window.
         shortest: steps that must remain at a start.
 
     Raises:
-        ValueError: if no frame can be started from.
+        ValueError: if no frame can be a start.
     """
     rotations, advance, remaining, passed = [], [], [], []
-    for motion, wrong in zip(motions, bad):
+    for motion, wrong in zip(motions, bad, strict=True):
         frames = len(motion.translation)
         usable = np.ones(frames, bool)
         usable[np.asarray(wrong, int)] = False
@@ -71,20 +71,20 @@ def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequenc
 
 
 def draw(clips: Clips, uniform: Array) -> Array:
-    """A start frame for a number in [0, 1)."""
+    """Return the start frame that a number in [0, 1) draws."""
     last = clips.chance.shape[0] - 1
     return jnp.minimum(jnp.searchsorted(clips.chance, uniform, side="right"), last).astype(jnp.int32)
 
 
 def poses(clips: Clips, frame: Array) -> Pose:
-    """Previous, current and following pose of a frame (leading axis 3), translations relative to the current's."""
+    """Previous, current and following pose of a frame (leading axis 3); translations relative to the current one."""
     before = clips.advance[frame - 1]
     translation = jnp.stack([-before, jnp.zeros_like(before), clips.advance[frame]])
     return Pose(clips.rotations[frame + jnp.arange(-1, 2)], translation)
 
 
 def there_and_back(clips: Clips, frame: Array, count: int) -> Pose:
-    """Windows [count, 3, ...] as of `poses` from a frame on, played there and back where its clip ends sooner."""
+    """Return windows [count, 3, ...] like those of `poses`, from a frame on; a clip that ends sooner turns back."""
     # from the frame before the first that has a window to the one after the last
     first, period = frame - clips.passed[frame], clips.passed[frame] + clips.remaining[frame]
     along = jnp.abs((frame - first + jnp.arange(-1, count + 1)) % (2 * period) - period)
@@ -105,5 +105,5 @@ def _advance(clips: Clips, start: Array, end: Array) -> Array:
 
 
 def standing(poses: Pose) -> Pose:
-    """The current pose of a window three times: the body holds still."""
+    """Repeat the current pose of a window three times: the body holds still."""
     return Pose(jnp.broadcast_to(poses.rotations[1:2], poses.rotations.shape), jnp.zeros_like(poses.translation))

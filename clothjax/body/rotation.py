@@ -28,7 +28,7 @@ def from_axis_angle(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def to_6d(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 6"]:
-    """The first two columns of rotation matrices [..., 3, 3] as [..., 6]; Zhou et al. 2019."""
+    """Return the first two columns of rotation matrices [..., 3, 3] as [..., 6]; Zhou et al. 2019."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 
@@ -41,10 +41,10 @@ def from_6d(code: Float[Array, "*n 6"], epsilon: float = 1e-12) -> Float[Array, 
 
 
 def heading(matrix: Float[Array, "3 3"], epsilon: float = 1e-12) -> Float[Array, "3 3"]:
-    """The rotation about +Y nearest to a rotation matrix [3, 3]: the direction its subject faces.
+    """Find the rotation about +Y nearest to a rotation matrix [3, 3]: the direction its subject faces.
 
-    It maximises trace(R_y^T R), so it commutes with turning the world about the vertical and is
-    undefined only for half turns about a horizontal axis, where it falls back to the identity.
+    It maximises trace(R_y^T R), so it commutes with rotations of the world about the vertical. It is undefined only
+    for half turns about a horizontal axis, where it falls back to the identity.
     """
     cosine = matrix[0, 0] + matrix[2, 2]
     sine = matrix[0, 2] - matrix[2, 0]

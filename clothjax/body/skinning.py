@@ -16,7 +16,7 @@ def shaped_joints(body: Body, betas: Float[Array, " S"]) -> Float[Array, "J 3"]:
 
 
 def shaped_vertices(wearable: Body | Garment, betas: Float[Array, " S"]) -> Float[Array, "N 3"]:
-    """Vertices [N, 3] m plus shape blend shapes, of a body or garment of shape `betas` [S], in the canonical pose."""
+    """Vertices [N, 3] m of a body or garment of shape `betas` [S], in the canonical pose."""
     return wearable.vertices + jnp.einsum("ncs,s->nc", wearable.shapedirs, betas, precision=HIGHEST)
 
 
@@ -30,19 +30,19 @@ def forward_kinematics(
         joints: [J, 3] m canonical joint positions.
         parents: [J] static integers, root -1, each before its children.
     """
-    # Pointer jumping: a joint's transform to its ancestor's frame, then to that one's ancestor's, twice as far each
-    # time, so that the tree takes the logarithm of its depth in steps, all joints at once.
+    # Pointer jumping: every joint's transform goes to its ancestor's frame, twice as far up the tree in each step, so
+    # that the number of steps is the logarithm of the tree's depth.
     ancestor = np.asarray(parents)
-    turn = rotations
+    rotation = rotations
     position = joints - jnp.where(ancestor[:, None] < 0, 0.0, joints[ancestor])
     while (ancestor >= 0).any():
         reached = (ancestor < 0)[:, None]
-        moved = position[ancestor] + jnp.einsum("jab,jb->ja", turn[ancestor], position, precision=HIGHEST)
-        turned = jnp.matmul(turn[ancestor], turn, precision=HIGHEST)
+        moved = position[ancestor] + jnp.einsum("jab,jb->ja", rotation[ancestor], position, precision=HIGHEST)
+        rotated = jnp.matmul(rotation[ancestor], rotation, precision=HIGHEST)
         position = jnp.where(reached, position, moved)
-        turn = jnp.where(reached[:, :, None], turn, turned)
+        rotation = jnp.where(reached[:, :, None], rotation, rotated)
         ancestor = np.where(ancestor < 0, -1, ancestor[ancestor])
-    return turn, position
+    return rotation, position
 
 
 def joint_transforms(
@@ -53,11 +53,11 @@ def joint_transforms(
 
 
 def bound_transforms(
-    turn: Float[Array, "J 3 3"], position: Float[Array, "J 3"], joints: Float[Array, "J 3"]
+    rotation: Float[Array, "J 3 3"], position: Float[Array, "J 3"], joints: Float[Array, "J 3"]
 ) -> Float[Array, "J 3 4"]:
     """`joint_transforms` from global rotations R [J, 3, 3], positions q [J, 3] m and canonical joints J [J, 3] m."""
-    offset = position - jnp.einsum("jab,jb->ja", turn, joints, precision=HIGHEST)
-    return jnp.concatenate([turn, offset[:, :, None]], axis=-1)
+    offset = position - jnp.einsum("jab,jb->ja", rotation, joints, precision=HIGHEST)
+    return jnp.concatenate([rotation, offset[:, :, None]], axis=-1)
 
 
 def blend(weights: Float[Array, "N J"], transforms: Float[Array, "J 3 4"]) -> Float[Array, "N 3 4"]:
@@ -67,19 +67,19 @@ def blend(weights: Float[Array, "N J"], transforms: Float[Array, "J 3 4"]) -> Fl
 
 
 def apply(transforms: Float[Array, "N 3 4"], points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    """Points [N, 3] m moved by their own transforms [N, 3, 4]."""
+    """Move points [N, 3] m by their own transforms [N, 3, 4]."""
     return jnp.einsum("nab,nb->na", transforms[:, :, :3], points, precision=HIGHEST) + transforms[:, :, 3]
 
 
 def unapply(transforms: Float[Array, "N 3 4"], points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    """The inverse of `apply`: canonical points [N, 3] m of posed points [N, 3] m."""
+    """Invert `apply`: return the canonical points [N, 3] m of posed points [N, 3] m."""
     return unapply_direction(transforms, points - transforms[:, :, 3])
 
 
 def unapply_direction(transforms: Float[Array, "N 3 4"], vectors: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    """Vectors [N, 3] carried back by the linear part of the transforms [N, 3, 4] (Cramer's rule).
+    """Carry vectors [N, 3] back by the linear part of the transforms [N, 3, 4] (Cramer's rule).
 
-    Blended matrices can be near singular (a joint folded by pi); the determinant is kept away from zero.
+    Blended matrices can be near singular (a joint folded by pi), so the determinant is bounded away from zero.
     """
     a, b, c = transforms[:, :, 0], transforms[:, :, 1], transforms[:, :, 2]
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)

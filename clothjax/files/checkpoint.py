@@ -1,8 +1,8 @@
 """Checkpoints of a training state: atomic, every leaf checked, readable in parts. The only user of Orbax.
 
-A checkpoint is the folder `DIRECTORY/STEP`: `state`, the leaves by name (`params/decoder/w`), and `about`, a
-JSON with the configuration and the shape, dtype and checksum of each leaf. Orbax writes under a temporary
-name and renames at the end, so a process killed at any moment leaves the checkpoint before it.
+A checkpoint is the folder `DIRECTORY/STEP`. In it, `state` has the leaves by name (`params/decoder/w`), and `about` is
+a JSON with the configuration and the shape, dtype and checksum of each leaf. Orbax writes under a temporary name and
+renames at the end, so a process killed at any moment leaves the checkpoint before it.
 """
 
 import shutil
@@ -18,14 +18,14 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 FORMAT = 1
-"""Of what is written; readers refuse a newer one."""
+"""Version of the format; readers refuse a newer one."""
 
 Tree = TypeVar("Tree")
 T = TypeVar("T")
 
 
 class Checkpoint(NamedTuple):
-    """What a checkpoint says about itself."""
+    """The description of a checkpoint."""
 
     path: Path
     step: int
@@ -39,13 +39,13 @@ class _Damaged(Exception):
 
 
 def save(directory: str | Path, step: int, state: Any, config: dict, description: str = "", *, keep: int = 3) -> None:
-    """Writes a checkpoint, then removes all but the newest `keep`. Each process of a run calls it.
+    """Write a checkpoint, then remove all but the newest `keep`. Each process of a run calls it.
 
     Args:
-        directory: of all checkpoints of a run; made if it is not there.
-        step: training steps taken.
+        directory: of all checkpoints of a run; created if it does not exist.
+        step: number of training steps so far.
         state: any pytree of arrays; typed random keys may be among them.
-        config: the run's configuration, as `configuration.to_dict` gives it.
+        config: the run's configuration, from `configuration.to_dict`.
         description: one line for a person.
 
     Raises:
@@ -72,7 +72,7 @@ def save(directory: str | Path, step: int, state: Any, config: dict, description
         with ocp.CheckpointManager(directory, options=options) as manager:
             parts = ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about))
             manager.save(step, args=parts)
-    except Exception as error:  # whatever Orbax makes of a disk that is full, slow or gone
+    except Exception as error:  # Orbax raises many kinds for a disk that is full, slow or gone
         before = f"step {existing[-1]} is whole" if existing else "there is none before it"
         raise OSError(
             f"{directory}: the checkpoint of step {step} could not be written ({before}): make room, and run the same "
@@ -81,7 +81,7 @@ def save(directory: str | Path, step: int, state: Any, config: dict, description
 
 
 def steps(directory: str | Path) -> list[int]:
-    """The steps of the complete checkpoints in a directory, ascending; empty where there are none."""
+    """List the steps of the complete checkpoints in a directory, ascending."""
     directory = Path(directory)
     if not directory.is_dir():
         return []
@@ -89,7 +89,7 @@ def steps(directory: str | Path) -> list[int]:
 
 
 def latest(directory: str | Path) -> Checkpoint:
-    """What the newest checkpoint says about itself.
+    """Return the description of the newest checkpoint.
 
     Raises:
         ValueError: if there is none, or a newer version of this library wrote it.
@@ -98,10 +98,11 @@ def latest(directory: str | Path) -> Checkpoint:
 
 
 def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
-    """The whole state of the newest undamaged checkpoint, bit for bit; warns of damaged ones passed over.
+    """Read the complete state of the newest undamaged checkpoint, bit for bit; warn of damaged ones.
 
     Args:
-        like: a state of the wanted structure, shapes, dtypes and sharding: arrays or `jax.ShapeDtypeStruct`s.
+        directory: of all checkpoints of a run.
+        like: a state of the expected structure, shapes, dtypes and sharding: arrays or `jax.ShapeDtypeStruct`s.
         step: of one checkpoint, instead of the newest.
 
     Raises:
@@ -111,11 +112,13 @@ def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tu
 
 
 def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
-    """As `restore`, but only the parts of the state that `like` names.
+    """Read only the parts of the state that `like` names, otherwise as `restore`.
 
     Args:
+        directory: of all checkpoints of a run.
         like: a dictionary from some of the state's keys or fields to trees as in `restore`, such as
             `{"params": ..., "statistics": ...}`.
+        step: of one checkpoint, instead of the newest.
 
     Raises:
         ValueError: if there is no undamaged checkpoint, or a leaf is missing or of another shape.
@@ -124,9 +127,9 @@ def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None)
 
 
 def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint]:
-    """Parts of the newest undamaged checkpoint as nested dictionaries, whatever their shapes are.
+    """Read parts of the newest undamaged checkpoint as nested dictionaries, whatever their shapes are.
 
-    Fields of a NamedTuple come back as a dictionary, and so do the elements of a list: by their numbers.
+    The fields of a NamedTuple come back as a dictionary, and so do the elements of a list, by their numbers.
 
     Raises:
         ValueError: if there is no undamaged checkpoint, or it has no such part.
@@ -152,7 +155,7 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
 
 
 def set_aside(directory: str | Path, after: int) -> None:
-    """Renames later checkpoints to `<step>.damaged`, so that a run resumed before them can save again."""
+    """Rename later checkpoints to `<step>.damaged`, so that a run resumed before them can save again."""
     directory = Path(directory)
     for step in steps(directory):
         if step > after:
@@ -162,7 +165,7 @@ def set_aside(directory: str | Path, after: int) -> None:
 
 
 def named(tree: Any) -> dict[str, Any]:
-    """Leaves by path. Dictionary keys and fields of a NamedTuple look alike: parts of either can be named."""
+    """Return the leaves by path. Dictionary keys and fields of a NamedTuple look alike, so `like` can name either."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     by_name = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
     assert len(by_name) == len(leaves), "two leaves of the state have the same path"
@@ -170,27 +173,30 @@ def named(tree: Any) -> dict[str, Any]:
 
 
 def _is_key(leaf: Any) -> bool:
+    """Return whether a leaf is a typed random key."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _plain(leaf: jax.Array) -> jax.Array:
+    """Return the data of a random key, and any other leaf as it is."""
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
 def _describe(leaf: jax.Array) -> dict:
+    """Return shape, dtype, checksum and, for a random key, its kind."""
     description = {"shape": list(leaf.shape), "dtype": str(leaf.dtype), "checksum": _checksum(_plain(leaf))}
     return description | ({"key": str(jax.random.key_impl(leaf))} if _is_key(leaf) else {})
 
 
 def _checksum(array: jax.Array) -> int | None:
-    """CRC-32 of the bytes (Orbax misses a flipped bit), or None for an array spread over processes."""
+    """Return the CRC-32 of the bytes (Orbax misses a flipped bit), or None for an array spread over processes."""
     if not (array.is_fully_addressable or array.is_fully_replicated):
         return None
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
 
 
 def _newest(directory: Path, step: int | None, read: Callable[[Path], T]) -> T:
-    """`read` of the newest checkpoint that is not damaged."""
+    """Call `read` on the newest checkpoint that is not damaged."""
     existing = steps(directory)
     if not existing:
         why = "holds no checkpoints (folders named by a step)" if directory.is_dir() else "does not exist"
@@ -207,12 +213,13 @@ def _newest(directory: Path, step: int | None, read: Callable[[Path], T]) -> T:
 
 
 def _about(path: Path) -> Checkpoint:
+    """Read the description of a checkpoint."""
     try:
         with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
             about = reader.restore(path / "about")
         version = about["format"]
         checkpoint = Checkpoint(path, about["step"], about["config"], about["description"], about["leaves"])
-    except Exception as error:  # whatever Orbax makes of broken files: the reason is kept in the message
+    except Exception as error:  # Orbax raises many kinds for broken files; the message has the reason
         raise _Damaged(f"its description cannot be read: {_first_line(error)}") from error
     if version > FORMAT:
         raise ValueError(f"{path}: has format {version}, this version of clothjax reads up to {FORMAT}; update it")
@@ -220,6 +227,7 @@ def _about(path: Path) -> Checkpoint:
 
 
 def _restore(directory: Path, like: Tree, step: int | None, *, whole: bool) -> tuple[Tree, Checkpoint]:
+    """Read the leaves of `like`; with `whole`, refuse a checkpoint that has others."""
     wanted = named(like)
 
     def read(path: Path) -> tuple[Tree, Checkpoint]:
@@ -232,7 +240,7 @@ def _restore(directory: Path, like: Tree, step: int | None, *, whole: bool) -> t
 
 
 def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
-    """Raises where names, shapes or dtypes differ. Orbax's partial restore accepts all of it in silence."""
+    """Raise a ValueError if names, shapes or dtypes differ. Orbax's partial restore accepts this silently."""
     hint = "another garment, other model sizes or another version of the model"
     for name, leaf in wanted.items():
         stored = checkpoint.leaves.get(name)
@@ -249,7 +257,7 @@ def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
 
 
 def _leaves(checkpoint: Checkpoint, wanted: dict[str, Any]) -> dict[str, jax.Array]:
-    """The wanted leaves, which the checkpoint has, checked against what was written."""
+    """Read leaves that the checkpoint has, and check them against their description."""
     default = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     abstract = {}
     for name, leaf in wanted.items():

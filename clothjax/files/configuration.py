@@ -19,20 +19,20 @@ Sources = dict[str, tuple[str, ...]]  # dotted path of a value -> the files that
 
 
 def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> Config:
-    """The configuration in a YAML file, over its `extends:` parents, under command-line overrides.
+    """Load a YAML file over its `extends:` parents, then apply command-line overrides.
 
     Mappings are merged key by key; every other value, lists included, replaces its parent's.
 
     Args:
         cls: a frozen dataclass whose fields are bool, int, float, str, Literal, tuples of these, Optional,
             `dict[str, X]` and dataclasses.
-        path: the YAML file; `extends: other.yaml` in it is relative to it.
+        path: the YAML file; `extends: other.yaml` is relative to it.
         overrides: such as `["--train.learning_rate", "3e-4"]`.
 
     Raises:
-        ValueError: for a file that is missing or not YAML, a cycle of `extends:`, an unknown key, a value of
-            the wrong type and whatever `__post_init__` refuses, naming the file and the dotted path.
-        SystemExit: for a mistake in `overrides`, after printing what is wrong with them, or for `--help`.
+        ValueError: for a file that is missing or not YAML, a cycle of `extends:`, an unknown key, a value of the
+            wrong type or one that `__post_init__` refuses. The message has the file and the dotted path.
+        SystemExit: for a mistake in `overrides`, after a message, or for `--help`.
     """
     try:
         values, sources = _read(Path(path), ())
@@ -43,7 +43,7 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
 
 
 def cli(cls: type[Config], argv: Sequence[str]) -> Config:
-    """The configuration that a command line asks for: a YAML file, then overrides such as `--train.seed 3`.
+    """Return the configuration of a command line: a YAML file, then overrides such as `--train.seed 3`.
 
     Without a file, the overrides change the defaults of `cls`.
 
@@ -64,7 +64,7 @@ def cli(cls: type[Config], argv: Sequence[str]) -> Config:
 
 
 def to_dict(config: Any) -> Any:
-    """The configuration as plain dictionaries and lists, for JSON and YAML."""
+    """Convert a configuration to plain dictionaries and lists, for JSON and YAML."""
     if dataclasses.is_dataclass(config):
         return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if isinstance(config, Mapping):
@@ -75,10 +75,10 @@ def to_dict(config: Any) -> Any:
 
 
 def from_dict(cls: type[Config], values: Mapping[str, Any], source: str = "configuration") -> Config:
-    """The inverse of `to_dict`; keys left out take their defaults.
+    """Invert `to_dict`; missing keys take their defaults.
 
     Args:
-        source: what to call `values` in messages, such as the file they came from.
+        source: name of `values` in messages, such as their file.
 
     Raises:
         ValueError: as `load`.
@@ -87,13 +87,14 @@ def from_dict(cls: type[Config], values: Mapping[str, Any], source: str = "confi
 
 
 def _override(cls: type[Config], config: Config, arguments: Sequence[str], prog: str) -> Config:
+    """Apply command-line arguments to a configuration."""
     import tyro
 
     return tyro.cli(cls, default=config, args=list(arguments), prog=prog)
 
 
 def _read(path: Path, children: tuple[Path, ...]) -> tuple[dict, Sources]:
-    """The values of a file over those of its parents, and which file each came from."""
+    """Read the values of a file over those of its parents, and the source file of each."""
     if path.resolve() in children:
         chain = " -> ".join(str(p) for p in (*children, path.resolve()))
         raise ValueError(f"{path}: `extends:` goes round in a circle: {chain}")
@@ -106,9 +107,8 @@ def _read(path: Path, children: tuple[Path, ...]) -> tuple[dict, Sources]:
         raise ValueError(f"{path}{child}: cannot be read: {error.strerror or error}") from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        raise ValueError(
-            f"{path}, line {mark.line + 1}: is not valid YAML: {error.problem or error.context}"
-        ) from error
+        line = f", line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{path}{line}: is not valid YAML: {error.problem or error.context}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: is not valid YAML: {' '.join(str(error).split())}") from error
     values = {} if values is None else values
@@ -124,7 +124,7 @@ def _read(path: Path, children: tuple[Path, ...]) -> tuple[dict, Sources]:
 
 
 def _refuse_duplicates(node: yaml.Node | None, path: Path) -> None:
-    """PyYAML lets the last of two equal keys win, in silence."""
+    """Raise a ValueError for a key that is set twice; PyYAML silently takes the last."""
     if isinstance(node, yaml.SequenceNode):
         for child in node.value:
             _refuse_duplicates(child, path)
@@ -140,6 +140,7 @@ def _refuse_duplicates(node: yaml.Node | None, path: Path) -> None:
 
 
 def _merge(old: dict, new: dict, prefix: str, sources: Sources, source: str) -> tuple[dict, Sources]:
+    """Merge the values `new` of the file `source` over `old`, key by key."""
     merged = dict(old)
     for key, value in new.items():
         path = _join(prefix, key)
@@ -158,7 +159,7 @@ def _join(prefix: str, key: Any) -> str:
 
 
 def _fail(message: str, path: str, sources: Sources, default: str) -> typing.NoReturn:
-    """Raises, naming the dotted path and the files that set the value there."""
+    """Raise a ValueError that names the dotted path and the files that set the value there."""
     known = path.partition("[")[0]  # an element of a list comes from where the list does
     while known and known not in sources:
         known = known.rpartition(".")[0]
@@ -167,7 +168,7 @@ def _fail(message: str, path: str, sources: Sources, default: str) -> typing.NoR
 
 
 def _build(cls: type, values: Any, path: str, sources: Sources, default: str) -> Any:
-    """The dataclass `cls` from the mapping found at `path`."""
+    """Build the dataclass `cls` from the mapping at `path`."""
     if not isinstance(values, Mapping):
         _fail(f"expected a mapping of settings, got {values!r}", path, sources, default)
     fields = {f.name: f for f in dataclasses.fields(cls)}
@@ -194,12 +195,12 @@ def _build(cls: type, values: Any, path: str, sources: Sources, default: str) ->
 
 
 def _coerce(hint: Any, value: Any, path: str, sources: Sources, default: str) -> Any:
-    """`value` as the declared type, or a ValueError."""
+    """Convert `value` to the declared type, or raise a ValueError."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _build(hint, value, path, sources, default)
     if origin in (typing.Union, types.UnionType):
-        (inner,) = (a for a in arguments if a is not type(None))  # Optional is the only union we declare
+        (inner,) = (a for a in arguments if a is not type(None))  # Optional is the only union that fields use
         return None if value is None else _coerce(inner, value, path, sources, default)
     if origin is typing.Literal:
         if not any(value == a and type(value) is type(a) for a in arguments):
@@ -230,11 +231,12 @@ def _coerce_tuple(arguments: tuple, value: Any, path: str, sources: Sources, def
         arguments = (arguments[0],) * len(value)
     if len(arguments) != len(value):
         _fail(f"expected {len(arguments)} values, got {len(value)}: {value!r}", path, sources, default)
-    return tuple(_coerce(a, v, f"{path}[{i}]", sources, default) for i, (a, v) in enumerate(zip(arguments, value)))
+    pairs = enumerate(zip(arguments, value, strict=True))
+    return tuple(_coerce(a, v, f"{path}[{i}]", sources, default) for i, (a, v) in pairs)
 
 
 def _scalar(kind: type, value: Any) -> bool | int | float | str | None:
-    """`value` as a bool, int, float or str; None where it is not one."""
+    """Convert `value` to a bool, int, float or str; return None if it is not one."""
     if kind in (bool, str) or isinstance(value, bool):
         return value if isinstance(value, kind) and isinstance(value, bool) == (kind is bool) else None
     try:

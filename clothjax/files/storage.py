@@ -9,16 +9,16 @@ Body, `format` "clothjax/body":
     weights_index [B, n] int16 and weights_value [B, n]: skinning weights, each row summing to 1;
     shapedirs [B, 3, S] and joint_shapedirs [J, 3, S], per standard deviation;
     optional posedirs [B, 3, 9 (J - 1)];
-    optional canonical_rotation [J, 3, 3], which turns each bone of the canonical pose to a T-pose.
+    optional canonical_rotation [J, 3, 3], which rotates each bone of the canonical pose to a T-pose.
 Garment, `format` "clothjax/garment", attribute `body`, the name of the body it is aligned with:
     vertices [V, 3]; faces [F, 3] int32; weights_index [V, n] int16 and weights_value [V, n];
     shapedirs [V, 3, S]; pin [V] bool, the vertices that follow skinning;
-    optional cloth [V, 3]: how many times the material's density, its mu and lam, and its bending the cloth has there.
+    optional cloth [V, 3]: factors of the material's density, of its mu and lam, and of its bending.
 Motion, `format` "clothjax/motion", attribute `fps` float64:
     poses [T, J, 3], axis-angle in radians, local to the parent; zero is the body's canonical pose;
     trans [T, 3] float64, of the root relative to its canonical place; joint_names [J] strings.
 
-On reading, any `format` that ends in /body, /garment or /motion will do, and further datasets are left alone.
+Readers accept any `format` that ends in /body, /garment or /motion, and ignore further datasets.
 """
 
 import os
@@ -33,19 +33,19 @@ from typing import NamedTuple
 
 import h5py
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from clothjax.types import Body, Garment, Motion
+from clothjax.types import Array, Body, Garment, Motion
 
 VERSION = 1
-# what readers of files raise where these are damaged or of another kind
+# exceptions that readers of files raise for damaged files or files of another kind
 UNREADABLE = (
     ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, RuntimeError, ArithmeticError, MemoryError,
     SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 ASSETS = Path(__file__).parents[1] / "assets"
-FACTORS = (0.01, 100.0)  # of a region's cloth over the garment's
+FACTORS = (0.01, 100.0)  # allowed range of the factors of a garment's cloth
 
 
 class Rig(NamedTuple):
@@ -60,7 +60,7 @@ class NewerFormat(ValueError):
 
 
 def refuse_newer(path: str | Path, version: int, known: int) -> None:
-    """Raises NewerFormat for a file of a format that is newer than the known one."""
+    """Raise NewerFormat for a file of a format that is newer than the known one."""
     if version > known:
         raise NewerFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")
 
@@ -69,7 +69,7 @@ def refuse_newer(path: str | Path, version: int, known: int) -> None:
 
 
 def asset(name: str | Path) -> Path:
-    """The file meant by a configuration: a path as it is, or a name of something embedded, as "tshirt_1000".
+    """Find the file of a configuration's entry: a path, or the name of an embedded asset such as "tshirt_1000".
 
     Raises:
         ValueError: for a name that is neither.
@@ -85,7 +85,7 @@ def asset(name: str | Path) -> Path:
 
 
 def asset_names(kind: str) -> tuple[str, ...]:
-    """Names of everything embedded of a kind: "body", "garment" or "motion", in alphabetical order."""
+    """List the names of the embedded assets of a kind, "body", "garment" or "motion", in alphabetical order."""
     files = sorted((ASSETS / "motions" if kind == "motion" else ASSETS).glob("*.h5"))
     names = tuple(file.stem for file in files)
     return names if kind == "motion" else tuple(n for n in names if (n == "body") == (kind == "body"))
@@ -95,7 +95,7 @@ def asset_names(kind: str) -> tuple[str, ...]:
 
 
 def load_body(path: str | Path) -> Body:
-    """The body in a file (or embedded), with dense skinning weights [B, J] float32.
+    """Read the body in a file (or embedded), with dense skinning weights [B, J] float32.
 
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
@@ -132,7 +132,7 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def load_garment(path: str | Path, body: Body) -> Garment:
-    """The garment in a file (or embedded), made for `body`.
+    """Read the garment in a file (or embedded), made for `body`.
 
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry; or if the body is far away.
@@ -141,7 +141,7 @@ def load_garment(path: str | Path, body: Body) -> Garment:
         sizes = {"J": len(body.parents), "S": np.shape(body.shapedirs)[-1]}
         vertices = _floats(file, "vertices", ("V", 3), sizes)
         _check_size(file, "largest extent of the garment", np.ptp(vertices, axis=0).max(), 0.05, 3.0)
-        distance = np.median(cKDTree(np.asarray(body.vertices)).query(vertices)[0])
+        distance = np.median(KDTree(np.asarray(body.vertices)).query(vertices)[0])
         if distance > 0.3:
             raise ValueError(
                 f"{file.filename}: half of the garment is more than {distance:.2f} m from the body: "
@@ -163,11 +163,11 @@ def load_garment(path: str | Path, body: Body) -> Garment:
 
 
 def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> Motion:
-    """The clip in a file (or embedded): rotations float32, translation float64.
+    """Read the clip in a file (or embedded): rotations float32, translation float64.
 
     Args:
         path: of the file.
-        joint_names: the body's, from `joint_names(body_path)`; the motion must have the same, in that order.
+        joint_names: the body's, from `joint_names(body_path)`; the motion must have the same in the same order.
 
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
@@ -190,13 +190,13 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
 
 
 def joint_names(path: str | Path) -> tuple[str, ...]:
-    """Joint names of a body or motion file (or embedded)."""
+    """Read the joint names of a body or motion file (or embedded)."""
     with _open(path, "") as file:
         return _names(file, {})
 
 
 def canonical_rotation(path: str | Path) -> np.ndarray:
-    """Rotations [J, 3, 3] of a body's bones from its canonical pose to a T-pose; identity if not stored."""
+    """Read the rotations [J, 3, 3] of a body's bones from its canonical pose to a T-pose; identity if not stored."""
     with _open(path, "body") as file:
         names = _names(file, {})
         if "canonical_rotation" not in file:
@@ -217,7 +217,7 @@ def save_body(
     licence: str,
     canonical_rotation: np.ndarray | None = None,
 ) -> None:
-    """Writes a body, whole or not at all."""
+    """Write a body, completely or not at all."""
     data = {
         "vertices": np.float32(body.vertices),
         "faces": np.int32(body.faces),
@@ -236,7 +236,7 @@ def save_body(
 
 
 def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str) -> None:
-    """Writes a garment, whole or not at all; `body` names the body it was made for."""
+    """Write a garment, completely or not at all; `body` names the body it was made for."""
     data = {
         "vertices": np.float32(garment.vertices),
         "faces": np.int32(garment.faces),
@@ -252,7 +252,7 @@ def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, so
 def save_motion(
     path: str | Path, motion: Motion, joint_names: Sequence[str], *, name: str, source: str, licence: str
 ) -> None:
-    """Writes a clip, whole or not at all."""
+    """Write a clip, completely or not at all."""
     rotations = np.asarray(motion.rotations, np.float64)
     poses = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(rotations.shape[:3])
     data = {
@@ -268,6 +268,7 @@ def save_motion(
 
 @contextmanager
 def _open(path: str | Path, kind: str) -> Iterator[h5py.File]:
+    """Open a file of a kind for reading, and check its attributes."""
     path = asset(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
@@ -277,31 +278,35 @@ def _open(path: str | Path, kind: str) -> Iterator[h5py.File]:
             if kind and form.rpartition("/")[2] != kind:
                 raise ValueError(f"{path}: attribute 'format' is {form!r}, expected 'clothjax/{kind}'")
             for key, wanted in (("version", VERSION), ("units", "m"), ("up", "+Y")):
-                found = _decoded(file.attrs.get(key, wanted))
-                if found != wanted:
-                    raise ValueError(f"{path}: attribute {key!r} is {found!r}, expected {wanted!r}")
+                value = _decoded(file.attrs.get(key, wanted))
+                if value != wanted:
+                    raise ValueError(f"{path}: attribute {key!r} is {value!r}, expected {wanted!r}")
             yield file
-    except (OSError, RuntimeError, KeyError) as error:  # what h5py raises for a damaged file
+    except (OSError, RuntimeError, KeyError) as error:  # h5py raises these for a damaged file
         raise ValueError(f"{path}: not a readable HDF5 file, perhaps cut short ({error})") from error
 
 
 def _dataset(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int]) -> np.ndarray:
-    """A dataset of a shape given by numbers and letters; a letter new to `sizes` takes the size found."""
+    """Read a dataset of a shape in numbers and letters; a letter new to `sizes` takes the size in the file."""
     if name not in file:
         raise ValueError(f"{file.filename}: dataset {name!r} is missing; it has {', '.join(sorted(map(str, file)))}")
-    found = file[name].shape
+    dataset = file[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise ValueError(f"{file.filename}: {name!r} is not a dataset but a {type(dataset).__name__}")
+    actual = dataset.shape
     wanted = tuple(sizes.get(n, n) for n in shape)
-    if found[:1] == (0,):
+    if actual[:1] == (0,):
         what = {"T": "frames", "J": "joints"}.get(shape[0], "rows")
         raise ValueError(f"{file.filename}: dataset {name!r} is empty, there are no {what} in it")
-    if len(found) != len(wanted) or any(isinstance(w, int) and w != f for f, w in zip(found, wanted)):
+    if len(actual) != len(wanted) or any(isinstance(w, int) and w != n for n, w in zip(actual, wanted, strict=True)):
         text = ", ".join(f"{n} = {sizes[n]}" if n in sizes else str(n) for n in shape)
-        raise ValueError(f"{file.filename}: dataset {name!r} has shape {found}, expected ({text})")
-    sizes.update({n: f for n, f in zip(shape, found) if isinstance(n, str)})
-    return file[name][()]
+        raise ValueError(f"{file.filename}: dataset {name!r} has shape {actual}, expected ({text})")
+    sizes.update({letter: n for letter, n in zip(shape, actual, strict=True) if isinstance(letter, str)})
+    return dataset[()]
 
 
 def _floats(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], dtype: type = np.float32) -> np.ndarray:
+    """Read a dataset of finite numbers."""
     value = _dataset(file, name, shape, sizes)
     if value.dtype.kind not in "fiu":
         raise ValueError(f"{file.filename}: dataset {name!r} must hold numbers, got {value.dtype}")
@@ -316,6 +321,7 @@ def _floats(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], dty
 
 
 def _integers(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], low: int, high: int) -> np.ndarray:
+    """Read a dataset of integers from `low` to `high` - 1."""
     value = _dataset(file, name, shape, sizes)
     if value.dtype.kind not in "iu":
         raise ValueError(f"{file.filename}: dataset {name!r} must hold integers, got {value.dtype}")
@@ -327,6 +333,7 @@ def _integers(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], l
 
 
 def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) -> np.ndarray:
+    """Read faces, each of three different vertices."""
     faces = _integers(file, "faces", shape, sizes, 0, vertices)
     a, b, c = faces.T
     twice = np.flatnonzero((a == b) | (b == c) | (c == a))
@@ -336,7 +343,7 @@ def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) 
 
 
 def _check_sides(file: h5py.File, faces: np.ndarray) -> None:
-    """Refuses what is no cloth with two sides."""
+    """Raise a ValueError if the faces are not a sheet with two sides."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     for rows, allowed in ((np.sort(ends, axis=1), 2), (ends, 1)):
         _, first, times = np.unique(rows, axis=0, return_index=True, return_counts=True)
@@ -351,6 +358,7 @@ def _check_sides(file: h5py.File, faces: np.ndarray) -> None:
 
 
 def _weights(file: h5py.File, letter: str, sizes: dict[str, int]) -> np.ndarray:
+    """Read sparse skinning weights as a dense array [letter, J]."""
     index = _integers(file, "weights_index", (letter, "n"), sizes, 0, sizes["J"])
     value = _floats(file, "weights_value", (letter, "n"), sizes)
     wrong = np.flatnonzero((np.abs(value.sum(axis=1) - 1) > 1e-3) | (value.min(axis=1, initial=0) < 0))
@@ -365,6 +373,7 @@ def _weights(file: h5py.File, letter: str, sizes: dict[str, int]) -> np.ndarray:
 
 
 def _cloth(file: h5py.File, sizes: dict[str, int]) -> np.ndarray:
+    """Read the factors of a garment's cloth."""
     factors = _floats(file, "cloth", ("V", 3), sizes)
     low, high = FACTORS
     wrong = np.argwhere((factors < low) | (factors > high))
@@ -376,12 +385,13 @@ def _cloth(file: h5py.File, sizes: dict[str, int]) -> np.ndarray:
     return factors
 
 
-def _sparse(weights: np.ndarray) -> dict[str, np.ndarray]:
+def _sparse(weights: Array) -> dict[str, np.ndarray]:
+    """Convert dense skinning weights to the datasets of the file."""
     weights = np.asarray(weights)
-    kept = max(int((weights > 0).sum(axis=1).max()), 1)
-    index = np.argsort(-weights, axis=1, kind="stable")[:, :kept]
+    influences = max(int((weights > 0).sum(axis=1).max()), 1)
+    index = np.argsort(-weights, axis=1, kind="stable")[:, :influences]
     value = np.take_along_axis(weights, index, axis=1)
-    return {"weights_index": np.int16(index), "weights_value": np.float32(value)}
+    return {"weights_index": index.astype(np.int16), "weights_value": value.astype(np.float32)}
 
 
 def _names(file: h5py.File, sizes: dict[str, int]) -> tuple[str, ...]:
@@ -394,12 +404,13 @@ def _decoded(value: object) -> object:
 
 
 def _strings(values: Sequence[str]) -> np.ndarray:
-    """Of one length, so that they stand in the dataset itself; HDF5 keeps others in a heap that no sum checks."""
+    """Encode strings at one length, so that the dataset holds them; HDF5 puts others in a heap without checksums."""
     encoded = [value.encode() for value in values]
     return np.array(encoded, h5py.string_dtype("utf-8", max(map(len, encoded), default=0) or 1))
 
 
 def _check_parents(file: h5py.File, parents: np.ndarray) -> None:
+    """Raise a ValueError if the first joint is not the only root, or a joint stands before its parent."""
     order = np.arange(len(parents))
     wrong = np.flatnonzero((parents >= order) | ((parents < 0) != (order == 0)))
     if len(parents) == 0 or len(wrong):
@@ -411,6 +422,7 @@ def _check_parents(file: h5py.File, parents: np.ndarray) -> None:
 
 
 def _check_size(file: h5py.File, what: str, size: float, low: float, high: float) -> None:
+    """Raise a ValueError for a length in m outside its range, with a guess at its real unit."""
     if low <= size <= high:
         return
     for unit, factor in (("centimetres", 100), ("millimetres", 1000)):
@@ -419,19 +431,21 @@ def _check_size(file: h5py.File, what: str, size: float, low: float, high: float
     raise ValueError(f"{file.filename}: {what} is {size:g} m, allowed {low} to {high}")
 
 
-def _refuse_joints(file: h5py.File, found: tuple[str, ...], wanted: tuple[str, ...]) -> None:
-    lacking = [n for n in wanted if n not in found]
-    further = [n for n in found if n not in wanted]
-    text = f"lacks {lacking}, has {further} besides" if lacking or further else f"has another order, {list(found)}"
+def _refuse_joints(file: h5py.File, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
+    """Raise a ValueError that lists how the joints of a motion differ from the body's."""
+    lacking = [n for n in wanted if n not in names]
+    further = [n for n in names if n not in wanted]
+    text = f"lacks {lacking}, has {further} besides" if lacking or further else f"has another order, {list(names)}"
     raise ValueError(f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)")
 
 
 def _write(path: str | Path, kind: str, data: dict[str, np.ndarray], **attributes) -> None:
+    """Write datasets and attributes under a temporary name, then rename the file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        # of this version all of a file is checked by sums: libhdf5 can crash where what describes the data is damaged
+        # this version has checksums for all of a file: libhdf5 can crash on a damaged description of the data
         with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             fixed = {"format": f"clothjax/{kind}", "version": VERSION, "units": "m", "up": "+Y"}
             for key, value in {**fixed, **attributes}.items():

@@ -1,1 +1,1 @@
-"""Triangle meshes: connectivity, coarser levels, what is nearest. Knows no cloth."""
+"""Triangle meshes: connectivity, coarser levels, nearest points and faces. Knows no cloth."""

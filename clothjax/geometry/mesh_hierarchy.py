@@ -17,22 +17,22 @@ Neighbours = list[list[int]]
 
 
 class Level(NamedTuple):
-    """One level of a mesh-convolution hierarchy: P of a graph's N vertices, each reading those around it."""
+    """One level of a mesh-convolution hierarchy: P sampled vertices of N, each reading those around it."""
 
-    kept: np.ndarray  # [P] int32, ascending indices into the N vertices
-    ids: np.ndarray  # [P, K] int32 of the N vertices, the kept one first, then ring by ring; padded with N
+    sampled: np.ndarray  # [P] int32, ascending indices into the N vertices
+    ids: np.ndarray  # [P, K] int32 of the N vertices, the sampled one first, then ring by ring; padded with N
     mask: np.ndarray  # [P, K] bool, true where `ids` is not padding
 
 
 def coarse_levels(faces: np.ndarray, levels: int, centre: int | None = None) -> list[np.ndarray]:
-    """Coarse edges of HOOD's multi-level message passing (Grigorev et al. 2023, section 4.3).
+    """Return the coarse edges of HOOD's multi-level message passing (Grigorev et al. 2023, section 4.3).
 
-    Each level removes the vertices at an odd hop distance from the centre and joins what they held together.
+    Each level removes the vertices at an odd hop distance from the centre and joins their neighbours.
 
     Args:
         faces: [F, 3] vertex indices.
-        levels: how many.
-        centre: vertex that the distances are counted from; by default `graph_centres` of each component.
+        levels: number of coarse levels.
+        centre: vertex from which distances are counted; by default `graph_centres` of each component.
 
     Returns:
         Undirected edges [E_l, 2] int32 of each level, lower index first, sorted; empty where a mesh is small.
@@ -58,7 +58,7 @@ def coarse_levels(faces: np.ndarray, levels: int, centre: int | None = None) -> 
 
 
 def vertex_levels(vertex_count: int, levels: Sequence[np.ndarray]) -> np.ndarray:
-    """Deepest coarse level [V] int32 that each vertex has an edge in, plus one; 0 for none."""
+    """Return the deepest coarse level [V] int32 in which each vertex has an edge, plus one; 0 for none."""
     deepest = np.zeros(vertex_count, np.int32)
     for index, level in enumerate(levels):
         deepest[level.reshape(-1)] = index + 1
@@ -66,14 +66,14 @@ def vertex_levels(vertex_count: int, levels: Sequence[np.ndarray]) -> np.ndarray
 
 
 def graph_centres(vertex_count: int, edges: np.ndarray) -> np.ndarray:
-    """A vertex of least eccentricity in each component, ordered as `topology.components`.
+    """Find a vertex of least eccentricity in each component, ordered as `topology.components`.
 
     Args:
         vertex_count: V.
         edges: [E, 2] undirected.
 
     Returns:
-        One vertex int32 per component. Up to `EXACT_CENTRE` vertices the lowest of the exact centres; above,
+        One vertex int32 per component: up to `EXACT_CENTRE` vertices the lowest exact centre. Larger graphs get
         the middle of a long shortest path, found by two breadth-first searches.
     """
     labels = topology.components(vertex_count, edges)
@@ -92,19 +92,19 @@ def hierarchy(
     restart: bool = True,
     seeds: Sequence[int] = (),
 ) -> tuple[Level, ...]:
-    """Vertices kept level by level, and what they read: graph sampling of Zhou et al. 2020.
+    """Sample vertices level by level and list the vertices that each reads: graph sampling of Zhou et al. 2020.
 
-    Deterministic, but dependent on the order of vertices and faces: the parameters of a convolution belong to
-    the tables they were made for.
+    The result is deterministic but depends on the order of vertices and faces. The parameters of a convolution
+    belong to the tables they were trained with.
 
     Args:
         faces: [F, 3] vertex indices.
         vertex_count: V.
-        strides: least hop distance between the vertices that each level keeps; 1 keeps all.
-        radii: hop distance within which a kept vertex reads its neighbours, one per stride.
-        full_search: link kept vertices up to 2 stride - 1 hops apart; otherwise up to stride.
+        strides: least hop distance between the vertices that each level samples; 1 samples all.
+        radii: hop distance within which a sampled vertex reads its neighbours, one per stride.
+        full_search: link sampled vertices up to 2 stride - 1 hops apart; otherwise up to stride.
         restart: sample every component. The published tool samples only what vertex 0 or the seeds reach.
-        seeds: vertices that every level keeps.
+        seeds: vertices that every level samples.
 
     Returns:
         One Level per stride.
@@ -114,7 +114,7 @@ def hierarchy(
     """
     if len(strides) != len(radii):
         raise ValueError(f"{len(strides)} strides but {len(radii)} radii; give one radius per stride")
-    for stride, radius in zip(strides, radii):
+    for stride, radius in zip(strides, radii, strict=True):
         if stride < 1 or radius < stride - 1:
             raise ValueError(
                 f"stride {stride} with radius {radius}: a stride must be at least 1 and its radius at least "
@@ -122,21 +122,21 @@ def hierarchy(
             )
     if any(not 0 <= seed < vertex_count for seed in seeds):
         raise ValueError(f"seeds {list(seeds)} must be vertices, 0 to {vertex_count - 1}")
-    neighbours = _ordered_neighbours(topology.mesh(faces, vertex_count).faces, vertex_count)
+    neighbours = _ordered_neighbours(np.asarray(topology.mesh(faces, vertex_count).faces), vertex_count)
     levels = []
-    for stride, radius in zip(strides, radii):
-        kept = _spaced(neighbours, stride, seeds, restart)
-        ids = _padded([_ball(neighbours, vertex, radius) for vertex in kept], len(neighbours))
-        levels.append(Level(np.array(kept, np.int32), ids, ids < len(neighbours)))
-        new = {vertex: index for index, vertex in enumerate(kept)}
+    for stride, radius in zip(strides, radii, strict=True):
+        sampled = _spaced(neighbours, stride, seeds, restart)
+        ids = _padded([_ball(neighbours, vertex, radius) for vertex in sampled], len(neighbours))
+        levels.append(Level(np.array(sampled, np.int32), ids, ids < len(neighbours)))
+        new = {vertex: index for index, vertex in enumerate(sampled)}
         reach = 2 * stride - 1 if full_search else stride
-        neighbours = [[new[w] for w in _ball(neighbours, v, reach) if w in new] for v in kept]
+        neighbours = [[new[w] for w in _ball(neighbours, v, reach) if w in new] for v in sampled]
         seeds = [new[seed] for seed in seeds]
     return tuple(levels)
 
 
 def _coarsen(neighbours: Neighbours, hops: np.ndarray) -> np.ndarray:
-    """HOOD's next level from the neighbours of every vertex and hop distances [V] from the centre."""
+    """Return the edges of HOOD's next level, from each vertex's neighbours and hop distance [V] from the centre."""
     coarse: list[set[int]] = [set() for _ in neighbours]
 
     def join(a, b):
@@ -153,8 +153,8 @@ def _coarsen(neighbours: Neighbours, hops: np.ndarray) -> np.ndarray:
         for a in inner[v]:
             for b in outer[v]:
                 join(a, b)
-    # Where an odd vertex leads no further out, its neighbours could lose touch. All such pairs are judged by
-    # the graph as it is now, the even neighbours after them by the graph as it grows.
+    # An odd vertex that leads no further out may be all that links its neighbours. These pairs are judged by
+    # the graph so far, the even neighbours after them by the growing graph.
     for a, b in [pair for v in odd if not outer[v] for pair in combinations(inner[v], 2) if far(*pair)]:
         join(a, b)
     for v in range(len(neighbours)):
@@ -166,26 +166,25 @@ def _coarsen(neighbours: Neighbours, hops: np.ndarray) -> np.ndarray:
 
 
 def _hops(vertex_count: int, edges: np.ndarray, sources: np.ndarray) -> np.ndarray:
-    """Hop distance [V] from the nearest source; 0 where there is none: HOOD counts loose vertices as even."""
+    """Return the hop distance [V] from the nearest source; 0 without one, as HOOD counts loose vertices as even."""
     graph = scipy.sparse.coo_array((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count)).tocsr()
     hops = dijkstra(graph, directed=False, indices=sources, unweighted=True, min_only=True)
     return np.where(np.isfinite(hops), hops, 0).astype(np.int32)
 
 
 def _exact_centres(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Grow the ball around every vertex at once, as rows of bits, until one holds its whole component."""
-    everyone = np.arange(len(labels))
+    """Grow the ball around every vertex at once, as rows of bits, until one fills its component."""
     neighbours = _neighbours(len(labels), edges)
     width = max(len(row) for row in neighbours)
-    slots = np.array([row + [v] * (width - len(row)) for v, row in zip(everyone, neighbours)], np.int64).T
-    whole = np.packbits(labels == np.arange(labels.max() + 1)[:, None], axis=1)
+    slots = np.array([row + [v] * (width - len(row)) for v, row in enumerate(neighbours)], np.int64).T
+    component_bits = np.packbits(labels == np.arange(labels.max() + 1)[:, None], axis=1)
     balls = np.packbits(np.eye(len(labels), dtype=bool), axis=1)
-    centres = np.full(len(whole), -1, np.int32)
+    centres = np.full(len(component_bits), -1, np.int32)
     while True:
-        full = (balls == whole[labels]).all(axis=1)
-        found, first = np.unique(labels[full], return_index=True)
-        new = centres[found] < 0
-        centres[found[new]] = np.flatnonzero(full)[first[new]]
+        full = (balls == component_bits[labels]).all(axis=1)
+        filled, first = np.unique(labels[full], return_index=True)
+        new = centres[filled] < 0
+        centres[filled[new]] = np.flatnonzero(full)[first[new]]
         if (centres >= 0).all():
             return centres
         grown = balls.copy()
@@ -195,37 +194,38 @@ def _exact_centres(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def _approximate_centres(labels: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Take the middle of a long shortest path of each component."""
     centres = np.unique(labels, return_index=True)[1]
     for component, start in enumerate(centres):
         member = np.flatnonzero(labels == component)
-        one = member[_hops(len(labels), edges, [start])[member].argmax()]
-        from_one = _hops(len(labels), edges, [one])[member]
+        one = member[_hops(len(labels), edges, np.array([start]))[member].argmax()]
+        from_one = _hops(len(labels), edges, np.array([one]))[member]
         other = member[from_one.argmax()]
-        from_other = _hops(len(labels), edges, [other])[member]
+        from_other = _hops(len(labels), edges, np.array([other]))[member]
         centres[component] = member[np.maximum(from_one, from_other).argmin()]
     return centres.astype(np.int32)
 
 
 def _neighbours(vertex_count: int, edges: np.ndarray) -> Neighbours:
-    """Neighbours of every vertex, ascending."""
+    """List the neighbours of every vertex, ascending."""
     senders, receivers = topology.directed(edges)
     ends = np.searchsorted(receivers, np.arange(vertex_count + 1))
     senders = senders.tolist()
-    return [senders[a:b] for a, b in zip(ends[:-1], ends[1:])]
+    return [senders[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def _ordered_neighbours(faces: np.ndarray, vertex_count: int) -> Neighbours:
-    """Neighbours in the order in which the faces first name them, which Zhou's sampling depends on."""
-    found: list[dict[int, None]] = [{} for _ in range(vertex_count)]
+    """List neighbours in the order in which the faces first name them; Zhou's sampling depends on it."""
+    neighbours: list[dict[int, None]] = [{} for _ in range(vertex_count)]
     for a, b, c in faces.tolist():
         for p, q in ((a, b), (b, c), (c, a)):
-            found[p].setdefault(q)
-            found[q].setdefault(p)
-    return [list(row) for row in found]
+            neighbours[p].setdefault(q)
+            neighbours[q].setdefault(p)
+    return [list(row) for row in neighbours]
 
 
 def _ball(neighbours: Neighbours, centre: int, radius: int) -> list[int]:
-    """Vertices within `radius` hops, breadth first from the centre."""
+    """List the vertices within `radius` hops, breadth first from the centre."""
     ball, seen, start = [centre], {centre}, 0
     for _ in range(radius):
         ring, start = ball[start:], len(ball)
@@ -238,10 +238,10 @@ def _ball(neighbours: Neighbours, centre: int, radius: int) -> list[int]:
 
 
 def _spaced(neighbours: Neighbours, stride: int, seeds: Sequence[int], restart: bool) -> list[int]:
-    """A maximal set of vertices at least `stride` hops apart, ascending: breadth first and greedy."""
-    seen, kept, queue = set(seeds), set(seeds), deque(seeds)
+    """Choose a maximal set of vertices at least `stride` hops apart, ascending: breadth first and greedy."""
+    seen, chosen, queue = set(seeds), set(seeds), deque(seeds)
     if not queue:
-        queue.append(0)  # as in the published tool, where it starts the search but is not itself kept here
+        queue.append(0)  # as in the published tool, where it starts the search but is not itself chosen here
     lowest = 0
     while True:
         while queue:
@@ -249,19 +249,19 @@ def _spaced(neighbours: Neighbours, stride: int, seeds: Sequence[int], restart: 
                 if w not in seen:
                     seen.add(w)
                     queue.append(w)
-                    if kept.isdisjoint(_ball(neighbours, w, stride - 1)):
-                        kept.add(w)
+                    if chosen.isdisjoint(_ball(neighbours, w, stride - 1)):
+                        chosen.add(w)
         while lowest < len(neighbours) and lowest in seen:
             lowest += 1
         if not restart or lowest == len(neighbours):
-            return sorted(kept)
+            return sorted(chosen)
         seen.add(lowest)
-        kept.add(lowest)
+        chosen.add(lowest)
         queue.append(lowest)
 
 
 def _padded(rows: list[list[int]], value: int) -> np.ndarray:
     table = np.full((len(rows), max(map(len, rows), default=0)), value, np.int32)
-    for line, row in zip(table, rows):
+    for line, row in zip(table, rows, strict=True):
         line[: len(row)] = row
     return table

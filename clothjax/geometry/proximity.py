@@ -1,4 +1,4 @@
-"""What is nearest: the point of a cloud, the triangle of a mesh, the place on a triangle."""
+"""Searches for the nearest point of a cloud, triangle of a mesh and point of a triangle."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from clothjax.types import Array
 
 BLOCK = 64  # points
 PATCH = 32  # triangles
-PART = 8  # triangles of a patch, which one dipole stands for
-SPREAD = 0.1  # of a part's area, the square of the length by which its dipole is spread
-PASSES = 4  # of all positions, before only those without an answer are gone through
-CHUNK = 32  # of the positions, gone through together after that
-STRIDES = 2  # of a search along a surface
+PART = 8  # triangles of a patch that one dipole stands for
+SPREAD = 0.1  # squared length by which a part's dipole is spread, as a fraction of the part's area
+PASSES = 4  # rounds over all positions, before only those without an answer are searched
+CHUNK = 32  # positions searched together after that
+STRIDES = 2  # steps of a search along a surface
 LAST = jnp.iinfo(jnp.int32).max
 
 
@@ -25,18 +25,19 @@ class Patches(NamedTuple):
     faces: Array  # [F, 3] int32
     across: Array  # [F, 3] int32, the face across the edge opposite a corner; itself where there is none
     border: Array  # [B] bool, vertices of an edge that only one face has
-    groups: Array  # [G, PATCH] int32, every face; the last of a group is repeated. Each PART of it is of neighbours
-    around: Array  # [B, R] int32, the faces that have a vertex; the last of a vertex is repeated
+    groups: Array  # [G, PATCH] int32, every face; a group repeats its last. Faces of each PART are neighbours
+    around: Array  # [B, R] int32, the faces that have a vertex; a vertex repeats its last
 
 
 def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
-    """Patches of a mesh [B, 3] m: halved along the longest side of their box until they are small enough."""
+    """Divide a mesh [B, 3] m into patches, halved along the longest side of their box until small enough."""
     faces = np.asarray(faces)
     # half-edges (a, b) and (b, a) meet
     start, end = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
-    other = {pair: index // 3 for index, pair in enumerate(zip(start.tolist(), end.tolist()))}
-    across = [other.get(pair, index // 3) for index, pair in enumerate(zip(end.tolist(), start.tolist()))]
-    open_edge = np.array([pair not in other for pair in zip(end.tolist(), start.tolist())])
+    other = {pair: index // 3 for index, pair in enumerate(zip(start.tolist(), end.tolist(), strict=True))}
+    reversed_edges = list(zip(end.tolist(), start.tolist(), strict=True))
+    across = [other.get(pair, index // 3) for index, pair in enumerate(reversed_edges)]
+    open_edge = np.array([pair not in other for pair in reversed_edges])
     border = np.zeros(len(vertices), bool)
     border[np.concatenate([start[open_edge], end[open_edge]])] = True
     centroids = np.asarray(vertices)[faces].mean(axis=1)
@@ -49,7 +50,7 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
         half = size * -(-len(members) // (2 * size))
         return halve(ordered[:half], size) + halve(ordered[half:], size)
 
-    # the same halves at every level, so that each PART of a patch is of neighbours too
+    # patches are halved in the same way, so that each PART of a patch holds neighbours too
     parts = [np.concatenate(halve(patch, PART)) for patch in halve(np.arange(len(faces)), PATCH)]
     groups = np.stack([np.pad(patch, (0, PATCH - len(patch)), mode="edge") for patch in parts])
     across = np.reshape(across, (-1, 3)).astype(np.int32)
@@ -57,6 +58,7 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
 
 
 def _around(faces: np.ndarray, count: int) -> np.ndarray:
+    """Return the faces [B, R] int32 around each of `count` vertices; a vertex repeats its last."""
     order = np.argsort(faces.reshape(-1), kind="stable")
     valence = np.bincount(faces.reshape(-1), minlength=count)
     first = np.cumsum(valence) - valence
@@ -67,17 +69,17 @@ def _around(faces: np.ndarray, count: int) -> np.ndarray:
 def winding_number(positions: Array, corners: Array, groups: Array, asked: Array) -> Array:
     """Winding number [V] of triangles [F, 3, 3] m about positions [V, 3] m: 1 inside a closed mesh, 0 outside.
 
-    For each part of a patch stands a dipole, the first order of Barill et al. (2018), spread so that it has no pole:
-    farther from the mesh than parts are large this is the winding number; nearer, at least on which side of 0.25 it is.
-    No gradient.
+    A dipole stands for each part of a patch: the first order of Barill et al. (2018), spread so that it has no
+    pole. The result is accurate farther from the mesh than the size of a part. Nearer, it is at least on the right
+    side of 0.25. No gradient.
 
     Args:
         groups: [G, PATCH] of `patches`.
-        asked: [V] bool, the positions to go through; those of the others are 0.
+        asked: [V] bool, the positions to evaluate; the others get 0.
     """
     positions, corners, groups = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, corners, groups)))
     members = groups.reshape(-1)
-    again = jnp.concatenate([jnp.zeros(1, bool), members[1:] == members[:-1]])  # what fills a group up
+    again = jnp.concatenate([jnp.zeros(1, bool), members[1:] == members[:-1]])  # repeats that fill a group up
     area = 0.5 * jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = jnp.where(again[:, None], 0.0, area[members]).reshape(-1, PART, 3)
     size = jnp.sqrt(jnp.sum(area * area, axis=-1, keepdims=True))
@@ -86,7 +88,7 @@ def winding_number(positions: Array, corners: Array, groups: Array, asked: Array
     centre = moment / jnp.maximum(size, 1e-30)
     rows, chunks = _chunks(asked)
 
-    def chunk(index, found):
+    def chunk(index, winding):
         row = jax.lax.dynamic_slice(rows, (index * CHUNK,), (CHUNK,))
         position = positions[jnp.minimum(row, len(positions) - 1)]
         # one coordinate after the other, so that it fuses
@@ -94,20 +96,20 @@ def winding_number(positions: Array, corners: Array, groups: Array, asked: Array
         along = sum(offset[i] * dipole[None, :, i] for i in range(3))
         squared = jnp.maximum(sum(x * x for x in offset) + SPREAD * size[None, :, 0], 1e-30)
         total = jnp.sum(along / (squared * jnp.sqrt(squared)), axis=1) / (4.0 * jnp.pi)
-        return found.at[row].set(total, mode="drop")
+        return winding.at[row].set(total, mode="drop")
 
     return jax.lax.fori_loop(0, chunks, chunk, jnp.zeros(len(positions), positions.dtype))
 
 
 def _chunks(chosen: Array) -> tuple[Array, Array]:
-    """The places of what is true of [V], in whole chunks filled up with V, and how many chunks have any."""
+    """Indices of the true entries of [V], padded with V to whole chunks, and the number of chunks that have any."""
     count = chosen.shape[0]
     (rows,) = jnp.nonzero(chosen, size=-(-count // CHUNK) * CHUNK, fill_value=count)
     return rows, -(-jnp.sum(chosen) // CHUNK)
 
 
 def nearest_point(positions: Array, points: Array) -> Array:
-    """Index [V] of the point [P, 3] m nearest to each position [V, 3] m; the first of equals.
+    """Find the index [V] of the point [P, 3] m nearest to each position [V, 3] m; the first of equals.
 
     Distances are taken about the points' centroid: |a|^2 - 2ab cancels badly far from the origin in float32.
     """
@@ -134,9 +136,12 @@ def nearest_point(positions: Array, points: Array) -> Array:
 
 
 def closest_on_triangle(positions: Array, corners: Array) -> tuple[Array, Array]:
-    """Barycentric coordinates [..., 3] of the point of a triangle [..., 3, 3] m nearest to [..., 3] m, and |.|^2 m^2.
+    """Find the point of a triangle [..., 3, 3] m nearest to a position [..., 3] m.
 
     Triangles without area are the segments they have shrunk to.
+
+    Returns:
+        Barycentric coordinates [..., 3] of the point, and its squared distance [...] m^2.
     """
     origin = corners[..., 0, :]
     b, c, p = (jnp.moveaxis(x - origin, -1, 0) for x in (corners[..., 1, :], corners[..., 2, :], positions))
@@ -144,10 +149,12 @@ def closest_on_triangle(positions: Array, corners: Array) -> tuple[Array, Array]
     return jnp.stack([1.0 - v - w, v, w], axis=-1), squared
 
 
-def _closest(b: Sequence[Array], c: Sequence[Array], p: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """(v, w) of the point v b + w c of the triangle (0, b, c) nearest to p, and |p - v b - w c|^2.
+def _closest(
+    b: Sequence[Array] | Array, c: Sequence[Array] | Array, p: Sequence[Array] | Array
+) -> tuple[Array, Array, Array]:
+    """Find (v, w) of the point v b + w c of the triangle (0, b, c) nearest to p, and |p - v b - w c|^2.
 
-    Vectors are given by their coordinates, so that nothing has an axis of three.
+    Vectors are given by their coordinates, so that no array has an axis of three.
     """
 
     def dot(x, y):
@@ -172,7 +179,7 @@ def _closest(b: Sequence[Array], c: Sequence[Array], p: Sequence[Array]) -> tupl
     safe = jnp.where(flat, 1.0, squared)
     v, w = dot(cross(p, c), normal) / safe, dot(cross(b, p), normal) / safe
     inside = ~flat & (v >= 0) & (w >= 0) & (v + w <= 1)
-    best = jnp.where(inside, apart(v, w), jnp.inf)  # of a sliver, an edge may be nearer: its inside is rounding
+    best = jnp.where(inside, apart(v, w), jnp.inf)  # an edge of a sliver may be nearer: its inside is rounding
     zero = jnp.zeros_like(v)
     third = along(cp - bp + bb - bc, bb - 2.0 * bc + cc)
     for side_v, side_w in ((along(bp, bb), zero), (zero, along(cp, cc)), (1.0 - third, third)):
@@ -183,10 +190,10 @@ def _closest(b: Sequence[Array], c: Sequence[Array], p: Sequence[Array]) -> tupl
 
 
 def nearest_face_around(positions: Array, body: Array, patches: Patches, vertices: Sequence[Array]) -> Array:
-    """Index [V] of the triangle of a mesh [B, 3] m nearest to each position [V, 3] m, sought from vertices near it.
+    """Find the index [V] of the triangle of a mesh [B, 3] m nearest to each position [V, 3] m, from vertices near it.
 
-    The faces around these vertices (each [V] int32) are tried, then those around the corner nearest to the place that
-    was found, and so on for `STRIDES`: it walks along the surface, and does not see another limb. No gradient.
+    The faces around these vertices (each [V] int32) are tried first, then those around the nearest corner of the best
+    face, `STRIDES` times. The search walks along the surface and does not see another limb. No gradient.
     """
     positions, body = jax.lax.stop_gradient((positions, body))
     corners = body[patches.faces]
@@ -194,9 +201,9 @@ def nearest_face_around(positions: Array, body: Array, patches: Patches, vertice
     table = jnp.transpose(corners[patches.around], (0, 2, 3, 1)).reshape(len(patches.around), 9, -1)
 
     def nearest(vertex: Array) -> tuple[Array, Array]:
-        found = table[vertex]
-        origin = [found[:, i] for i in range(3)]
-        b, c = ([found[:, first + i] - origin[i] for i in range(3)] for first in (3, 6))
+        triangles = table[vertex]
+        origin = [triangles[:, i] for i in range(3)]
+        b, c = ([triangles[:, first + i] - origin[i] for i in range(3)] for first in (3, 6))
         _, _, squared = _closest(b, c, [positions[:, i, None] - origin[i] for i in range(3)])
         least = jnp.min(squared, axis=1)
         place = jnp.min(jnp.where(squared == least[:, None], jnp.arange(squared.shape[1])[None], LAST), axis=1)
@@ -215,15 +222,15 @@ def nearest_face_around(positions: Array, body: Array, patches: Patches, vertice
 
 
 def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array | None = None) -> Array:
-    """Index [V] of the triangle [F, 3, 3] m nearest to each position [V, 3] m. Exact; no gradient.
+    """Find the index [V] of the triangle [F, 3, 3] m nearest to each position [V, 3] m. Exact; no gradient.
 
-    Groups are gone through in the order of the distance of their boxes, until the next box is farther than the
-    nearest triangle found.
+    Groups are visited in the order of the distance to their boxes, until the next box is farther than the nearest
+    triangle so far.
 
     Args:
         groups: [G, PATCH] of `patches`.
-        apart: [F, 3] int32, positions that a triangle is never the answer for: in a mesh's search of itself, its
-            corners.
+        apart: [F, 3] int32, three positions for which a triangle is never the answer. A mesh that searches itself
+            gives the corners of its triangles.
     """
     positions, corners, groups = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, corners, groups)))
     count, last_group = positions.shape[0], groups.shape[0] - 1
@@ -238,8 +245,8 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
         place = positions[:, None, axis]
         return jnp.square(jnp.maximum(jnp.maximum(low[None, :, axis] - place, place - high[None, :, axis]), 0.0))
 
-    # the group in the last bits of its squared distance, which becomes a little less: then a minimum, which
-    # vectorises, gives both, and the next in order is the least above the last
+    # The last bits of a squared distance hold its group; the distance becomes a little less. A minimum, which
+    # vectorises, then gives both, and the next in order is the least above the last.
     bits = (1 << last_group.bit_length()) - 1
     bound = jax.lax.bitcast_convert_type((beyond(0) + beyond(1) + beyond(2)).astype(jnp.float32), jnp.int32)
     keys = (jnp.maximum(bound - 1, 0) & ~bits) | jnp.arange(groups.shape[0], dtype=jnp.int32)[None]
@@ -253,9 +260,9 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
     def visit(number, position, keys, best, face, last):
         key = following(keys, last)
         group = jnp.minimum(key & bits, last_group)
-        found = table[group]
-        offset = [position[:, i, None] - found[:, i] for i in range(3)]
-        b, c = ([found[:, first + i] for i in range(3)] for first in (3, 6))
+        triangles = table[group]
+        offset = [position[:, i, None] - triangles[:, i] for i in range(3)]
+        b, c = ([triangles[:, first + i] for i in range(3)] for first in (3, 6))
         _, _, squared = _closest(b, c, offset)
         if apart is not None:
             own = jnp.any(jnp.asarray(apart)[groups[group]] == number[:, None, None], axis=-1)
@@ -286,7 +293,7 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
             return best, face, last, real & may_improve(following(key, last), best)
 
         state = (best[row_or_last], face[row_or_last], last[row_or_last], real)
-        found, found_face, _, _ = jax.lax.while_loop(lambda state: jnp.any(state[3]), more, state)
-        return best.at[row].set(found, mode="drop"), face.at[row].set(found_face, mode="drop")
+        row_best, row_face, _, _ = jax.lax.while_loop(lambda state: jnp.any(state[3]), more, state)
+        return best.at[row].set(row_best, mode="drop"), face.at[row].set(row_face, mode="drop")
 
     return jax.lax.fori_loop(0, chunks, chunk, (best, face))[1]

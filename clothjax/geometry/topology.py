@@ -61,7 +61,7 @@ def components(vertex_count: int, links: np.ndarray) -> np.ndarray:
 
 
 def boundary_mask(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Return which vertices [V] bool are on an edge that only one face has."""
+    """Return a mask [V] bool of the vertices on an edge that only one face has."""
     mask = np.zeros(vertex_count, bool)
     mask[_boundary(faces)] = True
     return mask

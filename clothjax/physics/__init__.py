@@ -1,1 +1,1 @@
-"""Energies of cloth, contact, a time step's potential, and two ways down it."""
+"""Energies of cloth, contact, the potential of a time step, and two ways to minimise it."""

@@ -1,4 +1,4 @@
-"""What each vertex and each edge of a garment may touch during a time step: planes, found once and kept."""
+"""Contact planes that the vertices and edges of a garment may touch, found once per time step."""
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,9 @@ from clothjax.geometry.vectors import unit
 from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
-DEEP = 0.7  # of a triangle's size, the root of its area: farther in than this the winding number has to agree
-WOUND = 0.25  # the least of it that does: it is 0 outside, 1 inside, and half of that behind an open sheet
-LEVEL = 1e-4  # m, planes that differ by less are one
+DEEP = 0.7  # of a triangle's size, the root of its area: deeper than this the winding number must agree
+WOUND = 0.25  # least winding number inside; it is 0 outside, 1 inside, and half of that behind an open sheet
+LEVEL = 1e-4  # m, planes that differ by less count as one
 
 
 def find(
@@ -28,18 +28,22 @@ def find(
     patches: Patches,
     ahead: Float[Array, "V 3"] | None = None,
 ) -> Contact:
-    """The contact planes of positions [V, 3] m: through the nearest point of the body, across the way there.
+    """Find the contact planes of positions [V, 3] m: through the nearest point of the body, normal to the offset.
 
-    The plane's distance is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
-    2005). Skinning turns skin inside out in bent hips and knees, and pushes it through to the other side: these then
-    say of what is centimetres in front of a body that it is in it. So inside and deep, by the size of the triangle, is
-    only what the body also winds around. Where the body ends, as where it was cut, the surface is taken to go on as far
-    as that. Plane and point go with their triangle to the next frame. A foot that passes by takes its planes along,
-    through what it will not touch: one that is deep in where the body then does not wind around it, stays behind.
+    The distance to a plane is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
+    2005). In bent hips and knees, skinning turns skin inside out and pushes it through to the other side. Pseudonormals
+    then call a position inside that is centimetres in front of the body. A position deep inside, by the size of its
+    triangle, therefore counts as inside only if the body winds around it. Past an open border of the body, the surface
+    is taken to continue by the same depth.
+
+    Plane and point move with their triangle to the next frame. A passing foot would take its planes along, through
+    cloth that it does not touch. A plane stays behind if it would leave the expected position deep inside where the
+    body does not wind around it.
 
     Args:
-        body, body_next: [B, 3] m at this frame and the next.
-        ahead: [V, 3] m, where the positions are expected at the next frame; None to leave out the last.
+        body: [B, 3] m at this frame.
+        body_next: [B, 3] m at the next frame.
+        ahead: [V, 3] m, expected positions at the next frame; None lets every plane move along.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
     face = nearest_face(positions, body[patches.faces], patches.groups)
@@ -54,7 +58,7 @@ def _planes(
     patches: Patches,
     ahead: Float[Array, "V 3"] | None,
 ) -> Contact:
-    """As `find`, with the nearest triangles [V] known."""
+    """Find contact planes as in `find`, from the nearest triangles [V]."""
     faces, corners = patches.faces, body[patches.faces]
     here, there = corners[face], body_next[faces[face]]
     weights, _ = jax.lax.stop_gradient(closest_on_triangle(positions, here))
@@ -71,16 +75,16 @@ def _planes(
     on_surface = (apart < ON_SURFACE**2) | (border[:, None] & ~deep)
     normal = jnp.where(on_surface, pseudonormal, side * offset / jnp.sqrt(jnp.where(on_surface, 1.0, apart)))
     local = jnp.einsum("vca,vc->va", _axes(here), normal, precision="highest")
-    turned = jnp.einsum("vca,va->vc", _axes(there), local, precision="highest")
-    lost = jnp.sum(turned * turned, axis=-1, keepdims=True) < 0.99  # a triangle without area has no axes
-    turned = jnp.where(lost, normal, turned)
+    normal_next = jnp.einsum("vca,va->vc", _axes(there), local, precision="highest")
+    no_axes = jnp.sum(normal_next * normal_next, axis=-1, keepdims=True) < 0.99  # of a triangle without area
+    normal_next = jnp.where(no_axes, normal, normal_next)
     if ahead is not None:
-        gap = jax.lax.stop_gradient(distance(ahead, point_next, turned))
+        gap = jax.lax.stop_gradient(distance(ahead, point_next, normal_next))
         doubtful = gap < -DEEP * jnp.sqrt(jax.lax.stop_gradient(_areas(there)))
         passed = doubtful & (winding_number(ahead, body_next[faces], patches.groups, doubtful) <= WOUND)
         back = gap - jnp.maximum(jax.lax.stop_gradient(distance(positions, point, normal)), 0.0)
-        point_next += jnp.where(passed, back, 0.0)[:, None] * turned
-    return Contact(point, point_next, normal, turned, faces[face, jnp.argmax(weights, axis=1)])
+        point_next += jnp.where(passed, back, 0.0)[:, None] * normal_next
+    return Contact(point, point_next, normal, normal_next, faces[face, jnp.argmax(weights, axis=1)])
 
 
 def find_at_edges(
@@ -92,15 +96,18 @@ def find_at_edges(
     patches: Patches,
     ahead: Float[Array, "V 3"] | None = None,
 ) -> EdgeContact:
-    """The contact of each edge where it comes nearest to the body between its ends, whose planes are `planes`.
+    """Find the contact of each edge at the place between its ends that comes nearest to the body.
 
-    That place is where the planes of both ends are equally far: over a body's edge, which has one of the ends on
-    either side, the point of the garment's edge above it; over a flat part the middle. What is nearest to it is sought
-    near what is nearest to the ends.
+    At that place the planes of both ends are equally far. Over an edge of the body with one end on either side, it is
+    the point of the garment's edge above it; over a flat part, the middle. The search for the nearest triangle starts
+    from those nearest to the ends.
 
     Args:
-        positions, ahead: [V, 3] m, as of `find`, whose `planes` [V, ...] are those of the vertices.
-        body, body_next: [B, 3] m at this frame and the next.
+        positions: [V, 3] m of the vertices.
+        planes: contact of the vertices, from `find`.
+        body: [B, 3] m at this frame.
+        body_next: [B, 3] m at the next frame.
+        ahead: [V, 3] m, as in `find`.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
     a, b = mesh.edges[:, 0], mesh.edges[:, 1]
@@ -108,8 +115,8 @@ def find_at_edges(
 
     def beyond(position, own, other):
         # how much farther an end is from its own plane than from that of the other end
-        mine, its = (distance(position, planes.point[i], planes.normal[i]) for i in (own, other))
-        return jnp.maximum(mine - its, 0.0) + LEVEL
+        to_own, to_other = (distance(position, planes.point[i], planes.normal[i]) for i in (own, other))
+        return jnp.maximum(to_own - to_other, 0.0) + LEVEL
 
     before, after = beyond(start, a, b), beyond(end, b, a)
     place = jax.lax.stop_gradient(before / (before + after))
@@ -119,12 +126,12 @@ def find_at_edges(
 
     face = nearest_face_around(between(positions), body, patches, [planes.index[end] for end in (a, b)])
     later = None if ahead is None else between(ahead)
-    found = _planes(between(positions), face, body, body_next, patches, later)
-    return EdgeContact(place, found.point_next, found.normal_next)
+    contact = _planes(between(positions), face, body, body_next, patches, later)
+    return EdgeContact(place, contact.point_next, contact.normal_next)
 
 
 def find_on_self(positions: Float[Array, "V 3"], patches: Patches) -> SelfContact:
-    """The nearest point of the garment [V, 3] m to each of its vertices, on triangles that it is no corner of."""
+    """Find the garment's point nearest to each of its vertices [V, 3] m, on triangles that do not have the vertex."""
     positions, patches = jax.tree.map(jnp.asarray, (positions, patches))
     corners = positions[patches.faces]
     face = nearest_face(positions, corners, patches.groups, patches.faces)
@@ -141,10 +148,11 @@ def find_on_self(positions: Float[Array, "V 3"], patches: Patches) -> SelfContac
 def find_at_centroids(
     positions: Float[Array, "V 3"], body: Float[Array, "B 3"], body_next: Float[Array, "B 3"], faces: Int[Array, "F 3"]
 ) -> Contact:
-    """The planes of the body's faces [F, 3] whose centroids are nearest to positions [V, 3] m, as in HOOD.
+    """Find the planes of the body's faces [F, 3] whose centroids are nearest to positions [V, 3] m, as in HOOD.
 
     Args:
-        body, body_next: [B, 3] m at this frame and the next.
+        body: [B, 3] m at this frame.
+        body_next: [B, 3] m at the next frame.
     """
     (point, normal), (point_next, normal_next) = centroids(body, faces), centroids(body_next, faces)
     face = nearest_point(positions, point)
@@ -167,7 +175,7 @@ def distance(
 
 
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
-    """Unit normals [V, 3] of the face, edge or vertex that barycentric coordinates [V, 3] are on; if it is a border."""
+    """Unit normals [V, 3] of the face, edge or vertex at barycentric coordinates [V, 3], and whether it is a border."""
     normals = unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = patches.faces
     weighted = _angles(corners)[:, :, None] * normals[:, None]
@@ -195,7 +203,7 @@ def _angles(corners: Array) -> Array:
 
 
 def _axes(corners: Array) -> Array:
-    """Orthonormal axes [V, 3, 3], as columns, that go with triangles [V, 3, 3] m."""
+    """Orthonormal axes [V, 3, 3], as columns, that move with triangles [V, 3, 3] m."""
     along = unit(corners[:, 1] - corners[:, 0])
     normal = unit(jnp.cross(along, corners[:, 2] - corners[:, 0]))
     return jnp.stack([along, jnp.cross(normal, along), normal], axis=-1)

@@ -1,9 +1,8 @@
 """The energies of cloth, each from positions and constants: no weights, no networks.
 
-Elementwise functions return one value per face, hinge or vertex, so that the same code gives the loss (a
-sum), the force (its gradient) and the reference solver's Hessian (second derivative, element by element).
-Every function is finite, with a finite gradient, at zero edges, zero areas, flat and folded hinges and zero
-slip.
+Elementwise functions return one value per face, hinge or vertex. The same code thus gives the loss (a sum), the
+force (its gradient) and the reference solver's Hessian (second derivative, element by element). Every function is
+finite, with a finite gradient, at zero edges, zero areas, flat and folded hinges and zero slip.
 """
 
 import jax
@@ -14,8 +13,8 @@ from clothjax.geometry.vectors import norm
 from clothjax.types import Array, Mesh, Rest, Scalar
 
 GRAVITY = 9.81  # m/s^2
-THICKNESS = 4.7e-4  # m, of the StVK membrane, HOOD and SNUG
-SLIVER = 1e-6  # of a hinge's squared size, twice the area of a face that has no direction
+THICKNESS = 4.7e-4  # m, of the StVK membrane in HOOD and SNUG
+SLIVER = 1e-6  # twice the area, over a hinge's squared size, below which a face has no direction
 COLLISION_OFFSET = 3e-3  # m, the cloth is pushed out to this distance from the body
 
 
@@ -45,7 +44,7 @@ def rest_measures(vertices: Float[Array, "V 3"], mesh: Mesh, flat: bool = True) 
 
 
 def vertex_areas(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Float[Array, " V"]:
-    """Area [V] m^2 that belongs to each vertex [V, 3] m: a third of its faces [F, 3]."""
+    """Area [V] m^2 that belongs to each vertex [V, 3] m: a third of the area of its faces [F, 3]."""
     corners = vertices[faces]
     areas = 0.5 * norm(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     return jnp.zeros_like(vertices[:, 0]).at[faces.reshape(-1)].add(jnp.repeat(areas / 3.0, 3))
@@ -54,9 +53,9 @@ def vertex_areas(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Flo
 def regional(
     rest: Rest, areas: Float[Array, " V"], mesh: Mesh, cloth: Float[Array, "V 3"]
 ) -> tuple[Rest, Float[Array, " V"]]:
-    """Rest measures and areas [V] of cloth that is not the same everywhere.
+    """Scale rest measures and areas [V] m^2 by the factors of cloth that is not the same everywhere.
 
-    The measures of an element weigh its energy, so they stand for how much of the material is there.
+    The measures of an element weigh its energy, so scaling them scales the material there.
 
     Args:
         cloth: [V, 3] factors of density, of mu and lam, and of bending; elements take the mean of their corners.
@@ -64,7 +63,7 @@ def regional(
     _, stretching, bending = cloth.T
     return rest._replace(
         face_area=rest.face_area * jnp.mean(stretching[mesh.faces], axis=1),
-        hinge_area=rest.hinge_area / jnp.mean(bending[mesh.hinges], axis=1),  # which bending divides by
+        hinge_area=rest.hinge_area / jnp.mean(bending[mesh.hinges], axis=1),  # the bending energy divides by it
     ), areas * cloth[:, 0]
 
 
@@ -93,7 +92,7 @@ def stretching(
 def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 if flat, or where a face has hardly any area."""
     offsets = corners[:, 1:] - corners[:, :1]
-    # the angle has no size, what it is made of is of fifth order in length: that would underflow in float32
+    # the angle does not depend on size, but sine and cosine below are of fifth order in length and would underflow
     size = jax.lax.stop_gradient(jnp.max(jnp.abs(offsets), axis=(1, 2), keepdims=True))
     offsets = offsets / jnp.where(size > 0, size, 1.0)
     edge = offsets[:, 0]
@@ -144,9 +143,9 @@ def friction(
 ) -> Float[Array, " V"]:
     """HOOD's friction potential [V] J: c g m kappa |tau| where a vertex touches the body.
 
-    tau is the slip [V, 3] m relative to the body without its part along the contact normal [V, 3], and
-    kappa = sqrt(1 - cos^2(tau, up) + 1e-4) weakens it along gravity. |tau| is smoothed over `smoothing` m
-    (0 gives HOOD's value, with a zero gradient at zero slip).
+    tau is the slip [V, 3] m relative to the body, without its part along the contact normal [V, 3].
+    kappa = sqrt(1 - cos^2(tau, up) + 1e-4) weakens it along gravity. |tau| is smoothed over `smoothing` m; 0 gives
+    HOOD's value, with a zero gradient at zero slip.
     """
     tangential = slip - jnp.sum(slip * normal, axis=-1, keepdims=True) * normal
     squared = jnp.sum(tangential * tangential, axis=-1)

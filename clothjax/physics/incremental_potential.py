@@ -16,9 +16,9 @@ FRICTION_SMOOTHING = 1e-4  # m
 
 
 class TimeStep(NamedTuple):
-    """Everything the incremental potential of a step depends on, but the new positions."""
+    """Everything that the incremental potential of a step depends on, except the new positions."""
 
-    position: Array  # [V, 3] m, now
+    position: Array  # [V, 3] m, at the current frame
     velocity: Array  # [V, 3] m per step, so that position + velocity is the inertial prediction
     mass: Array  # [V] kg
     rest: Rest
@@ -41,16 +41,16 @@ LAWS = Laws()
 
 
 def touching(position: Float[Array, "V 3"], contact: Contact) -> Bool[Array, " V"]:
-    """Return bool [V]: which vertices [V, 3] m are within `FRICTION_RADIUS` of their contact planes."""
+    """Return a mask [V] of the vertices [V, 3] m within `FRICTION_RADIUS` of their contact planes."""
     return contact_search.distance(position, contact.point, contact.normal) < FRICTION_RADIUS
 
 
 def elements(
     new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
 ) -> dict[str, Array]:
-    """Every term of the incremental potential at new positions [V, 3] m, element by element, in J.
+    """Evaluate every term of the incremental potential at new positions [V, 3] m, element by element, in J.
 
-    The sums of these are what training minimises and what the reference solver minimises: there is no other energy.
+    Training and the reference solver both minimise the sum of these; there is no other energy.
     """
     moved = new - step.position
     contact = step.contact
@@ -66,7 +66,7 @@ def elements(
     if contact is not None:
         gap = contact_search.distance(new, contact.point_next, contact.normal_next)
         terms["collision"] = config.collision_stiffness * laws.collision(gap, config.collision_offset)
-    if step.touching is not None:
+    if contact is not None and step.touching is not None:
         normal = contact.normal + contact.normal_next
         length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
         terms["friction"] = friction(
@@ -88,7 +88,7 @@ def elements(
 def edge_collision(
     ends: Float[Array, "*n 2 3"], contact: EdgeContact, config: PhysicsConfig, laws: Laws = LAWS
 ) -> Float[Array, "*n"]:
-    """Collision energy [...] J of edges [..., 2, 3] m at the places that touch."""
+    """Collision energy [...] J of edges [..., 2, 3] m at the places that may touch the body."""
     start, end = ends[..., 0, :], ends[..., 1, :]
     # differences first: far from the origin the place itself is coarse
     offset = (start - contact.point_next) + contact.place[..., None] * (end - start)
@@ -99,7 +99,7 @@ def edge_collision(
 def self_collision(
     points: Float[Array, "*n 4 3"], contact: SelfContact, config: PhysicsConfig, laws: Laws = LAWS
 ) -> Float[Array, "*n"]:
-    """Collision energy [...] J of vertices and the corners of the triangles they may touch [..., 4, 3] m."""
+    """Collision energy [...] J of vertices and the triangles they may touch: vertex, then corners [..., 4, 3] m."""
     offset = jnp.sum(contact.weights[..., :, None] * (points[..., :1, :] - points[..., 1:, :]), axis=-2)
     distance = jnp.sum(offset * contact.normal, axis=-1)
     return config.collision_stiffness * laws.collision(distance, config.self_offset)
@@ -108,10 +108,10 @@ def self_collision(
 def energies(
     new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
 ) -> dict[str, Array]:
-    """The terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
+    """Evaluate the terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
     return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws).items()}
 
 
 def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Float[Array, ""]:
-    """The incremental potential in J at unit physical weights: what a time step of the cloth minimises."""
-    return sum(energies(new, step, mesh, config).values())
+    """Incremental potential in J at unit physical weights, which a time step of the cloth minimises."""
+    return sum(energies(new, step, mesh, config).values())  # pyright: ignore[reportReturnType]  # there are terms

@@ -1,7 +1,7 @@
 """The reference solver: a time step of the cloth as the minimum of the potential that training minimises.
 
-Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures how
-far a network is from the optimum; it is never used to train.
+The solver is Newton's method on the sparse Hessian, assembled element by element, in float64 on the host. It measures
+how far a network is from the optimum; it is never used to train.
 """
 
 from functools import partial
@@ -20,23 +20,23 @@ from clothjax.types import Array, Mesh
 VERTEX_TERMS = ("gravity", "inertia", "friction", "collision")
 CG_ITERATIONS = 600
 SHORTEST_STEP = 1e-8
-ROUNDING = 1e-13  # of the sum of all energies, without signs
-TORN = 2.0  # times the length at rest
-SUNK = 0.01  # m
-TOLERANCE = 1e-6  # of the remaining force, over the weight
+ROUNDING = 1e-13  # rounding error of the potential, over the sum of the absolute energies
+MAX_STRETCH = 2.0  # plausible length over that at rest
+MAX_DEPTH = 0.01  # m, plausible depth in the body
+TOLERANCE = 1e-6  # remaining force over the weight
 
 
 class Structure(NamedTuple):
-    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and which element blocks each sums."""
+    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and the element blocks that each sums."""
 
     indptr: np.ndarray  # [V + 1] int32
     indices: np.ndarray  # [N] int32, column of each block
     diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
-    gather: scipy.sparse.csr_array  # [N, P] ones, where block n sums the block of a pair of corners of an element
+    gather: scipy.sparse.csr_array  # [N, P] ones, where block n sums the block of a pair of an element's corners
 
 
 class SolverInfo(NamedTuple):
-    """How a solve ended."""
+    """The outcome of a solve."""
 
     converged: bool
     iterations: int
@@ -44,16 +44,16 @@ class SolverInfo(NamedTuple):
     relative_gradient: float  # gradient_norm over the norm of the free vertices' weights
     energy: float  # J
     stretch: float  # the largest of a face in any direction, 1 at rest
-    depth: float  # m, of the free vertex that is farthest behind the surface that it may touch
+    depth: float  # m, of the free vertex farthest behind the surface that it may touch
 
     @property
     def ok(self) -> bool:
-        """Whether this is cloth, too: a minimum can be of a step that nothing could have taken well."""
-        return self.converged and self.stretch < TORN and self.depth < SUNK
+        """True if converged and physically plausible: no face stretched twofold, no vertex deeper than 1 cm."""
+        return self.converged and self.stretch < MAX_STRETCH and self.depth < MAX_DEPTH
 
 
 def structure(step: TimeStep, mesh: Mesh) -> Structure:
-    """The sparsity pattern of the Hessian of a time step."""
+    """Return the sparsity pattern of the Hessian of a time step."""
     count = len(step.mass)
     rows, columns = [], []
     for corners in _corners(step, mesh):
@@ -71,7 +71,7 @@ def structure(step: TimeStep, mesh: Mesh) -> Structure:
 
 
 def _corners(step: TimeStep, mesh: Mesh) -> list[np.ndarray]:
-    """Vertices of the elements that the potential is a sum over, kind by kind."""
+    """List the vertices of the elements over which the potential is a sum, kind by kind."""
     vertices = np.arange(len(step.mass))[:, None]
     kinds = [np.asarray(mesh.faces), np.asarray(mesh.hinges), vertices]
     if step.edge_contact is not None:
@@ -92,26 +92,27 @@ def solve_step(
     max_iterations: int = 500,
     laws: Laws = LAWS,
 ) -> tuple[np.ndarray, SolverInfo]:
-    """The positions that minimise `incremental_potential.potential` over the vertices that are not pinned.
+    """Minimise `incremental_potential.potential` over the vertices that are not pinned.
 
-    Newton's method: conjugate gradients on the exact Hessian, cut off at negative curvature, preconditioned
-    by the 3 x 3 diagonal blocks of a positive semidefinite one (see `hessians`), then a line search. The
-    minimum is a local one, of which folds have many: compare energies, not positions. Contact planes and the
-    friction mask are those of `step`, so the potential is smooth.
+    The method is Newton's, with conjugate gradients on the exact Hessian and a line search. The conjugate gradients
+    stop at negative curvature. Their preconditioner is the 3 x 3 diagonal blocks of a positive semidefinite Hessian
+    (see `hessians`). The minimum is a local one, of which folds have many: compare energies, not positions. Contact
+    planes and the friction mask are those of `step`, so the potential is smooth.
 
     Args:
-        new0: [V, 3] m, where to start; pinned vertices stay there.
-        step: the time step; taken to float64.
+        new0: [V, 3] m, first positions; pinned vertices stay there.
+        step: the time step; converted to float64.
+        mesh: connectivity of the elements.
         pinned: [V] bool.
         config: constants of contact and friction.
-        tolerance: where to stop: the norm of the remaining force on the free vertices, as a fraction of the
-            norm of their weights. This does not depend on the start, where penetration can make any force.
-        max_iterations: Newton iterations.
+        tolerance: the solve stops at this norm of the remaining force on the free vertices, as a fraction of the
+            norm of their weights. It does not depend on the start, where penetration can make any force.
+        max_iterations: most Newton iterations.
         laws: of stretching and collision; others than the default are for comparisons.
 
     Returns:
-        Positions [V, 3] m in float64, and how it ended: `converged` is false where the tolerance was not met, `ok`
-        also where a face is stretched to twice its length or a vertex is deep in the body.
+        Positions [V, 3] m in float64, and the outcome. `converged` is false if the tolerance was not met. `ok` is
+        also false if a face is stretched to twice its length or a vertex is deep in the body.
 
     Raises:
         ValueError: a start that is not finite, or a vertex without mass.
@@ -145,7 +146,7 @@ def solve_step(
 
 
 def _present(step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[TimeStep, Mesh]:
-    """The step and the mesh without the hinges of a scene that has no bending."""
+    """Return the step and the mesh, without hinges if the scene has no bending."""
     if "bending" not in config.without:
         return step, mesh
     rest = step.rest._replace(hinge_area=step.rest.hinge_area[:0], hinge_angle=step.rest.hinge_angle[:0])
@@ -157,13 +158,14 @@ def hessians(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Blocks [N, 3, 3] N/m of the exact Hessian of the potential at [V, 3] m, and of a semidefinite one.
 
-    The second keeps, of stretching, the stress clamped to tension (principal values >= 0); of bending, the
-    square of the residual's gradient (Gauss-Newton); of terms of single vertices, the positive eigenvalues.
+    The second clamps the stress of stretching to tension (principal values >= 0). It takes the square of the
+    residual's gradient for bending (Gauss-Newton), and the positive eigenvalues for terms of single vertices.
     """
-    return tuple(
+    exact, semidefinite = (
         (pattern.gather @ np.asarray(blocks).reshape(-1, 9)).reshape(-1, 3, 3)
         for blocks in _element_hessians(x, step, mesh, config, laws)
     )
+    return exact, semidefinite
 
 
 @partial(jax.jit, static_argnames=("config", "laws"))
@@ -218,7 +220,7 @@ def _element_hessians(x: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfi
 
 
 def _stretching_semidefinite(corners: Array, step: TimeStep) -> Array:
-    """[F, 3, 3, 3, 3] N/m, the Hessian of stretching with the second Piola-Kirchhoff stress clamped."""
+    """Hessian [F, 3, 3, 3, 3] N/m of stretching with the second Piola-Kirchhoff stress clamped."""
     inverse, mu, lam = step.rest.inverse, step.material.mu, step.material.lam
     eye = jnp.eye(2, dtype=corners.dtype)
     # F = sum_i x_i b_i^T
@@ -248,7 +250,7 @@ def _stretching_semidefinite(corners: Array, step: TimeStep) -> Array:
 
 
 def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
-    """[H, 4, 3, 4, 3] N/m, Gauss-Newton of bending: k / (4 A) r'^T r' with r = l (theta - theta_0)."""
+    """Gauss-Newton Hessian [H, 4, 3, 4, 3] N/m of bending: k / (4 A) r'^T r' with r = l (theta - theta_0)."""
 
     def residual(points, rest_angle):
         edge = points[1] - points[0]
@@ -263,7 +265,7 @@ def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
 
 @partial(jax.jit, static_argnames=("config", "laws"))
 def _value_and_gradient(x, step, mesh, config, laws):
-    """The potential, its gradient, and what rounding can do to the potential."""
+    """Evaluate the potential, its gradient, and a bound on the potential's rounding error."""
 
     def potential(x):
         elements = incremental_potential.elements(x, step, mesh, config, laws)
@@ -275,7 +277,7 @@ def _value_and_gradient(x, step, mesh, config, laws):
 
 @jax.jit
 def _condition(x: Array, step: TimeStep, mesh: Mesh, free: Array) -> tuple[Array, Array]:
-    """The largest stretch of a face, and the depth in m of the deepest free vertex."""
+    """Measure the largest stretch of a face, and the depth in m of the deepest free vertex."""
     strain = energies.green_strain(x[mesh.faces], step.rest.inverse)
     mean, spread = 0.5 * (strain[:, 0, 0] + strain[:, 1, 1]), 0.5 * (strain[:, 0, 0] - strain[:, 1, 1])
     largest = mean + jnp.sqrt(spread * spread + strain[:, 0, 1] * strain[:, 0, 1])
@@ -288,11 +290,13 @@ def _condition(x: Array, step: TimeStep, mesh: Mesh, free: Array) -> tuple[Array
 
 
 def _host(result, free) -> tuple[float, np.ndarray, float]:
+    """Bring the result of `_value_and_gradient` to the host, with the gradient of pinned vertices set to zero."""
     energy, gradient, rounding = result
     return float(energy), np.where(free, np.asarray(gradient), 0.0), float(rounding)
 
 
 def _check(x: np.ndarray, step: TimeStep) -> None:
+    """Raise a ValueError for a start that is not finite or a vertex without mass."""
     bad = ~np.isfinite(x).all(axis=1)
     if bad.any():
         raise ValueError(f"solve_step: new0[{np.argmax(bad)}] is {x[np.argmax(bad)]}; a start must be finite")
@@ -305,13 +309,13 @@ def _check(x: np.ndarray, step: TimeStep) -> None:
 
 
 def to_float64(leaf: Array) -> np.ndarray:
-    """An array of floats in float64, any other as it is."""
+    """Convert an array of floats to float64; return any other as it is."""
     leaf = np.asarray(leaf)
     return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
 
 
 def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
-    """A descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature."""
+    """Return a descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature."""
     # with D = L L^T the diagonal blocks, solve (L^-1 H L^-T) y = -L^-1 g: no preconditioner inside the loop
     root = np.linalg.inv(np.linalg.cholesky(np.asarray(semidefinite)[pattern.diagonal]))
     rows = np.repeat(np.arange(len(root)), np.diff(pattern.indptr))
@@ -340,7 +344,7 @@ def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) 
 
 
 def _line_search(evaluate, x, energy, gradient, direction, free):
-    """Backtracking (Armijo) from x; the last result is whether a better point was found."""
+    """Backtrack (Armijo) along a direction from x; the last result is true if a better point was found."""
     slope = float(np.sum(gradient * direction))
     squared = float(np.sum(gradient * gradient))
     length = 1.0

@@ -1,1 +1,1 @@
-"""A garment on a character, frame by frame, whatever moves it."""
+"""Simulation of a garment on a character, frame by frame, with any animator."""

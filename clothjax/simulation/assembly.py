@@ -1,4 +1,4 @@
-"""An experiment's fixed parts, put together from its configuration: files, scene, clips, character."""
+"""The fixed parts of an experiment, assembled from its configuration: files, scene, clips, character."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -16,34 +16,38 @@ from clothjax.simulation.characters import Character
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array, Body, Garment, Material, Motion
 
-MEASURABLE = 12  # frames of a motion, at least, for all that is measured of it
+MEASURABLE = 12  # least number of frames that all measures need
 
 
 class Experiment(NamedTuple):
-    """The parts that a configuration names, loaded."""
+    """The loaded parts that a configuration names."""
 
     config: Config
     names: tuple[str, ...]  # of the joints
-    body: Body  # whole
+    body: Body  # complete, unlike that of the scene
     garment: Garment
     scene: Scene
 
 
 def assemble(config: Config) -> Experiment:
-    """Loads the garment and the body of a configuration and builds their scene."""
+    """Load the garment and the body of a configuration and build their scene."""
     body = storage.load_body(config.body)
     garment = storage.load_garment(config.garment, body)
     return Experiment(config, storage.joint_names(config.body), body, garment, scene.build_scene(garment, body, config))
 
 
 def dress(experiment: Experiment, betas: Array | np.ndarray, material: Material) -> Character:
-    """A character of shape `betas` [S] in cloth of `material`, compiled with the scene as a constant."""
+    """Build a character of shape `betas` [S] in cloth of `material`, compiled with the scene as a constant."""
     dressed = jax.jit(lambda b, m: characters.dress(experiment.scene, b, m, experiment.config.physics))
     return dressed(jnp.asarray(betas), material)
 
 
-def motion(experiment: Experiment, name: str) -> Motion:
-    """A clip, by asset name or path, checked against the experiment's joints and frame rate."""
+def motion(experiment: Experiment, name: str | Path) -> Motion:
+    """Load a clip by asset name or path, and check its joints and frame rate against the experiment.
+
+    Raises:
+        ValueError: if they differ, or the clip moves in an experiment whose body is still.
+    """
     clip = storage.load_motion(name, experiment.names)
     if abs(clip.fps - experiment.config.fps) > 1e-3:
         raise ValueError(
@@ -56,61 +60,62 @@ def motion(experiment: Experiment, name: str) -> Motion:
 
 
 def _stands(clip: Motion) -> bool:
+    """Return whether a clip holds one pose."""
     return all(
         np.abs(np.asarray(part) - np.asarray(part[:1])).max() < 1e-6 for part in (clip.rotations, clip.translation)
     )
 
 
 def training_motions(config: Config) -> tuple[str, ...]:
-    """The clips to train on: those named, or every embedded one but those kept for evaluation."""
+    """Return the names of the training clips: those configured, or all embedded ones not used for evaluation."""
     if config.motions:
         return config.motions
-    kept = {Path(name).stem for name in config.evaluation.motions}
-    return tuple(name for name in storage.asset_names("motion") if name not in kept)
+    evaluated = {Path(name).stem for name in config.evaluation.motions}
+    return tuple(name for name in storage.asset_names("motion") if name not in evaluated)
 
 
 def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
-    """The training clips on one reel, and the number of frames left out of each for moving impossibly fast."""
+    """Load the training clips, and return them with the number of impossibly fast frames left out of each."""
     names = training_motions(experiment.config)
     motions = [motion(experiment, name) for name in names]
     bad = [plausibility.bad_frames(clip, experiment.body) for clip in motions]
-    # the kind of motion, as in walk_0 or cmu_01_02: kinds are drawn equally often
+    # a family is a kind of motion, as in walk_0 or cmu_01_02; families are drawn equally often
     families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
     stages = [experiment.config.stage1] + [experiment.config.tuning] * (experiment.config.tuning.steps > 0)
     shortest = max(max(stage.rollout, stage.rollout_end) for stage in stages) + 1
     try:
-        reel = motion_clips.concatenate(motions, families, bad, shortest)
+        clips = motion_clips.concatenate(motions, families, bad, shortest)
     except ValueError as error:
         left_out = sum(map(len, bad))
         raise ValueError(
             f"{', '.join(names)}: {error}; {left_out} frames were left out, a joint jumps there"
         ) from error
-    return reel, {name: len(wrong) for name, wrong in zip(names, bad)}
+    return clips, {name: len(wrong) for name, wrong in zip(names, bad, strict=True)}
 
 
 def evaluation_motion(experiment: Experiment, name: str | Path) -> Motion:
-    """A motion to measure on, with no more than `evaluation.frames` frames.
+    """Load a motion to measure on, cut to `evaluation.frames` frames.
 
     Raises:
-        ValueError: as `motion`, and for fewer frames than can be measured.
+        ValueError: as `motion`, and for fewer frames than the measures need.
     """
-    clip, most = motion(experiment, name), experiment.config.evaluation.frames
-    clip = Motion(clip.rotations[:most], clip.translation[:most], clip.fps)
+    clip, limit = motion(experiment, name), experiment.config.evaluation.frames
+    clip = Motion(clip.rotations[:limit], clip.translation[:limit], clip.fps)
     if len(clip.translation) < MEASURABLE:
         raise ValueError(
-            f"{name}: {len(clip.translation)} frames to measure on (`evaluation.frames` is {most}); at least "
+            f"{name}: {len(clip.translation)} frames to measure on (`evaluation.frames` is {limit}); at least "
             f"{MEASURABLE} are needed"
         )
     return clip
 
 
 def windows(clip: Motion) -> Clips:
-    """One clip on a reel of its own, every frame of it usable."""
+    """Return the clips of one motion, with every frame usable."""
     return motion_clips.concatenate([clip], [""], [np.zeros(0, int)], 1)
 
 
 def there_and_back(clip: Motion, frames: int) -> Motion:
-    """A clip played forwards and backwards until it has `frames` frames: long, and nowhere a jump."""
+    """Play a clip forwards and backwards until it has `frames` frames, without a jump."""
     count = len(clip.translation)
     period = max(2 * count - 2, 1)
     order = np.abs((np.arange(frames) + count - 1) % period - (count - 1))
@@ -118,10 +123,10 @@ def there_and_back(clip: Motion, frames: int) -> Motion:
 
 
 def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
-    """Betas [S] and material of a thin, the mean and a heavy body in soft, middling and stiff cloth.
+    """Return betas [S] and material of nine characters: thin, mean and heavy in soft, middling and stiff cloth.
 
-    Thin and heavy are `evaluation.betas` standard deviations along the direction in which the body's volume grows most
-    of those in which its height stays.
+    Thin and heavy are `evaluation.betas` standard deviations along the direction of fastest growth in volume at
+    constant height.
     """
     body, cloth = experiment.body, experiment.config.material
     count = body.shapedirs.shape[-1]
@@ -148,7 +153,7 @@ def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
 
 
 def betas(config: Config) -> np.ndarray:
-    """The body shape that evaluation uses: drawn from its own seed, uniform in +-`evaluation.betas`."""
+    """Draw the body shape of evaluation from its own seed, uniform in +-`evaluation.betas`."""
     size = storage.load_body(config.body).shapedirs.shape[-1]
     limit = config.evaluation.betas
     return np.random.default_rng(config.evaluation.betas_seed).uniform(-limit, limit, size).astype(np.float32)

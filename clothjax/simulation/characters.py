@@ -1,4 +1,4 @@
-"""A wearer: one body shape and one cloth in a scene, and how it stands at a frame."""
+"""A character: one body shape and one cloth in a scene, and its geometry at a frame."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from clothjax.types import Array, Material, Pose, Rest
 
 
 class Character(NamedTuple):
-    """What betas and material decide."""
+    """The part of a simulation that depends on betas and material."""
 
     template: Array  # [V, 3] m, the shaped garment in the canonical pose
     body: Array  # [B, 3] m, the shaped body within reach
@@ -44,22 +44,24 @@ class Window(NamedTuple):
 
 
 def dress(scene: Scene, betas: Array | None, material: Material, config: PhysicsConfig) -> Character:
-    """The character of shape `betas` [S] wearing cloth of `material`; without betas, the shape it was modelled in.
+    """Build the character of shape `betas` [S] in cloth of `material`; without betas, the shape is the modelled one.
 
-    That shape is measured once, when a program is compiled.
+    The modelled shape is measured once, when a program is compiled.
     """
     if betas is None:
         betas = jnp.zeros(scene.body.shapedirs.shape[-1])
         with jax.ensure_compile_time_eval():
-            *shape, areas = _shape(scene, betas, config)
+            template, body, joints, rest, areas = _shape(scene, betas, config)
     else:
-        *shape, areas = _shape(scene, betas, config)
-    return Character(*shape, mass=areas * material.density, material=material, betas=betas)
+        template, body, joints, rest, areas = _shape(scene, betas, config)
+    return Character(template, body, joints, rest, mass=areas * material.density, material=material, betas=betas)
 
 
 def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Rest, Array]:
-    """What the betas decide: template, body, joints, rest measures, and the areas [V] m^2 of the vertices, all
-    weighted by the garment's cloth."""
+    """Return template, body, joints, rest measures and vertex areas [V] m^2 of a shape.
+
+    Rest measures and areas are weighted by the garment's cloth.
+    """
     template = skinning.shaped_vertices(scene.garment, betas)
     measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
     rest = energies.rest_measures(measured, scene.mesh)
@@ -76,8 +78,8 @@ def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Ar
 
 
 def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
-    """The character at a pose whose translation [3] m is relative to the root's at the current frame."""
-    transforms = skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents)
+    """Return the character at a pose whose translation [3] m is relative to the root's at the current frame."""
+    transforms = jnp.asarray(skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents))
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
     body = skinning.apply(
         skinning.blend(scene.body.weights, transforms),
@@ -95,7 +97,7 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
 
 
 def window(scene: Scene, character: Character, poses: Pose) -> Window:
-    """Three frames of `poses` (leading axis 3), their translations [3, 3] m relative to the middle one's."""
+    """Return three frames from `poses` (leading axis 3), with translations [3, 3] m relative to the middle one's."""
     if scene.still:
         now = frame(scene, character, jax.tree.map(lambda x: x[1], poses))
         return Window(now, now, now)
@@ -108,5 +110,5 @@ def window(scene: Scene, character: Character, poses: Pose) -> Window:
 
 
 def skinned(character: Character, frame: Frame) -> Array:
-    """The garment [V, 3] m by skinning alone."""
+    """Return the garment [V, 3] m by skinning alone."""
     return skinning.apply(frame.garment, character.template)

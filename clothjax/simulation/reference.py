@@ -1,4 +1,4 @@
-"""The reference solver frame by frame: what the cloth would do, by the same energies that train the networks."""
+"""The reference solver frame by frame: the motion of the cloth by the same energies that train the networks."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,15 +23,15 @@ class Problem(NamedTuple):
 
     step: TimeStep
     skinned: Array  # [V, 3] m, plain skinning at the next frame
-    held: Array  # [V, 3] m, the canonical displacement kept
+    hold: Array  # [V, 3] m, persistence: the canonical displacement of the current frame at the next
     advance: Array  # [3] m, of the root
 
 
 def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, Pose], Problem]:
-    """A jitted function that states a time step.
+    """Return a jitted function that states a time step.
 
-    Its arguments are the wearer, the garment [V, 3] m at the last frame and at this one, each relative to the root
-    then, and the three poses around the step.
+    Its arguments are the character, the garment [V, 3] m at the last frame and at this one, each relative to its
+    root, and the three poses around the step.
     """
 
     @jax.jit
@@ -40,10 +40,10 @@ def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, 
         velocity = now - (before + poses.translation[0][None])
         cloth = ClothState(now, velocity, jnp.zeros_like(now), *[jnp.zeros(0, now.dtype)] * 2)
         step = time_step.time_step(scene, character, cloth, window, 1.0 / config.fps, config)
-        held = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
-        skinned = characters.skinned(character, window.following)
-        held = jnp.where(scene.garment.pinned[:, None], skinned, held)
-        return Problem(step, skinned, held, poses.translation[2])
+        hold = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
+        lbs = characters.skinned(character, window.following)
+        hold = jnp.where(scene.garment.pinned[:, None], lbs, hold)
+        return Problem(step, lbs, hold, poses.translation[2])
 
     return state
 
@@ -56,18 +56,21 @@ def simulate(
     *,
     start: tuple[Array, Array] | None = None,
     max_iterations: int = 500,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[np.ndarray, list[SolverInfo]]:
-    """A motion, solved: the garment [T + 1, V, 3] m relative to the root at every frame, and how each solve ended.
+    """Solve a motion frame by frame.
 
-    A frame whose solve did not converge says so in its `SolverInfo`, and the next one goes on from what there is.
+    If the solve of a frame does not converge, its `SolverInfo` says so, and the next frame continues from its result.
 
     Args:
-        poses: windows [T, 3, ...] of `clips.poses`, one a frame.
+        poses: windows [T, 3, ...] of `motion_clips.poses`, one a frame.
         start: the garment [V, 3] m at the frame before the first and at the first, each relative to its root. By
             default it starts like Phi: skinned, then one long quasi-static step, whose info comes first.
-        max_iterations: of Newton's method, in a frame.
-        progress: called with the number of frames done.
+        max_iterations: most Newton iterations in a frame.
+        progress: called with the number of finished frames.
+
+    Returns:
+        The garment [T + 1, V, 3] m relative to the root at every frame, and the outcome of each solve.
     """
     garment, infos = scene.garment, []
     state = problem(scene, config)
@@ -80,22 +83,22 @@ def simulate(
         return np.asarray(new, np.float32)
 
     if start is None:
-        skinned, velocity, long = _quasi_static(scene, character, _at(poses, 0), config)
-        now = solve(skinned, long)
+        lbs, velocity, long_step = _quasi_static(scene, character, _at(poses, 0), config)
+        now = solve(lbs, long_step)
         before = now - np.asarray(velocity) - np.asarray(poses.translation[0, 0])[None]
     else:
         before, now = (np.asarray(x, np.float32) for x in start)
     trajectory = [now]
     for frame in range(poses.translation.shape[0]):
-        step, _, held, advance = state(character, before, now, _at(poses, frame))
-        before, now = now, solve(held, step) - np.asarray(advance)[None]
+        step, _, hold, advance = state(character, before, now, _at(poses, frame))
+        before, now = now, solve(hold, step) - np.asarray(advance)[None]
         trajectory.append(now)
         progress(len(trajectory))
     return np.stack(trajectory), infos
 
 
 def _quasi_static(scene: Scene, character: Character, poses: Pose, config: Config) -> tuple[Array, Array, TimeStep]:
-    """A garment as skinned on the standing body, the velocity it is given after that, and the long step it takes."""
+    """Return a garment as skinned on the standing body, its velocity after the first step, and that long step."""
 
     @jax.jit
     def state(poses: Pose):
@@ -110,4 +113,5 @@ def _quasi_static(scene: Scene, character: Character, poses: Pose, config: Confi
 
 
 def _at(poses: Pose, frame: int) -> Pose:
+    """Return the window of a frame."""
     return Pose(poses.rotations[frame], poses.translation[frame])

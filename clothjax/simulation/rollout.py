@@ -1,4 +1,4 @@
-"""One frame of a garment that an animator moves, and rollouts: scans of frames with the losses accumulated inside."""
+"""Steps of a garment by an animator, and rollouts: scans over frames that accumulate the losses."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,11 +15,11 @@ from clothjax.simulation import characters
 from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.scene import Scene
 from clothjax.simulation.time_step import start, time_step
-from clothjax.types import Array, ClothState, Pose
+from clothjax.types import Array, ClothState, Pose, Scalar
 
 
 class StepInput(NamedTuple):
-    """All that an animator may look at to move a garment by one frame."""
+    """The inputs from which an animator moves a garment by one frame."""
 
     state: ClothState
     poses: Pose  # three poses, leading axis 3
@@ -29,23 +29,23 @@ class StepInput(NamedTuple):
 
 
 class StepOutput(NamedTuple):
-    """Where an animator moves a garment."""
+    """The outputs of an animator for one frame."""
 
     position: Array  # [V, 3] m, relative to the root at the current frame
-    code: Array  # [L] what the animator carries to the next frame
-    seen: Any = None  # pytree of features that its running statistics are to observe
+    code: Array  # [L] memory that the animator carries to the next frame
+    seen: Any = None  # pytree of features for its running statistics
 
 
 class Animator(NamedTuple):
-    """What moves one character's garment: a network, or the physics itself."""
+    """A method that moves one character's garment: a network, or the physics itself."""
 
     memory_size: int  # L, numbers carried from frame to frame
     step: Callable[[StepInput], StepOutput]
-    recurrent: bool = False  # whether gradients of the code reach back over all frames of a rollout
+    recurrent: bool = False  # True if gradients of the code reach back over all frames of a rollout
 
 
 class Taken(NamedTuple):
-    """A step that was taken, and what its potential was made of."""
+    """A step that was taken, and the constants of its potential."""
 
     position: Array  # [V, 3] m, relative to the root at the current frame
     time_step: TimeStep
@@ -66,10 +66,10 @@ def take(
     character: Character,
     state: ClothState,
     poses: Pose,
-    timestep: Array,
+    timestep: Scalar,
     config: Config,
 ) -> tuple[ClothState, Taken]:
-    """Take one frame; the state returned is still relative to the current root."""
+    """Take one frame of `timestep` s; the returned state is still relative to the current root."""
     window = characters.window(scene, character, poses)
     step = time_step(scene, character, state, window, timestep, config)
 
@@ -83,20 +83,24 @@ def take(
 
 
 def follow(state: ClothState, advance: Array) -> ClothState:
-    """Express a state relative to the root of the next frame, which is `advance` [3] m further on."""
+    """Express a state relative to the root of the next frame, which is `advance` [3] m from the current one."""
     return state._replace(position=state.position - advance[None])
 
 
 def advance(
     animator: Animator, scene: Scene, character: Character, state: ClothState, poses: Pose, config: Config
 ) -> tuple[ClothState, Array]:
-    """Take one frame of a motion: the state, relative to the root of the next frame, and the positions [V, 3] m."""
+    """Take one frame of a motion.
+
+    Returns:
+        The state, relative to the root of the next frame, and the positions [V, 3] m, relative to the current root.
+    """
     taken, (position, _, _) = take(animator, scene, character, state, poses, 1.0 / config.fps, config)
     return follow(taken, poses.translation[2]), position
 
 
 def settle(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
-    """The state a motion starts from: skinned, then (HOOD) one long quasi-static step on the standing body."""
+    """Return the first state of a motion: skinned, then (HOOD) one long quasi-static step on the standing body."""
     state = start(character, characters.window(scene, character, poses), animator.memory_size)
     if config.stage1.start_timestep == 0:
         return state
@@ -118,13 +122,16 @@ def training_rollout(
     config: Config,
     weigh: Callable[[dict[str, Array]], tuple[Array, dict[str, Array]]],
 ) -> tuple[Array, tuple[ClothState, dict, Any]]:
-    """Mean loss over `frames` frames from a state, with the last state, mean energies in J, and all that was seen.
+    """Roll out `frames` frames from a state and average their losses.
 
-    A `fresh` state takes the quasi-static step first: the body stands, the step is long, and what it started with as
-    velocity is given back after it. Gradients reach back over `config.stage1.gradient_frames` frames.
+    A `fresh` state takes the quasi-static step first: the body stands, the step is long, and the state gets its first
+    velocity back after it. Gradients reach back over `config.stage1.gradient_frames` frames.
 
     Args:
         weigh: from the energies of a step in J to the loss, and the energies to report.
+
+    Returns:
+        The mean loss; the last state, mean energies in J, and the animator's features of every frame.
     """
 
     def body(carry, index):
@@ -158,7 +165,7 @@ def training_rollout(
 
 
 def play(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> Track:
-    """An autoregressive rollout of an animator over a motion, from `settle` on.
+    """Roll out an animator autoregressively over a motion, from `settle` on.
 
     Args:
         poses: windows [T, 3, ...] of `motion_clips.poses`.

@@ -1,18 +1,18 @@
-"""What stays fixed while an experiment runs: garment, the body within its reach, graphs and tables. NumPy only."""
+"""The fixed part of an experiment: garment, the body within its reach, graphs and tables. NumPy only."""
 
 from typing import NamedTuple
 
 import jraph
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
 from clothjax.geometry.proximity import Patches, patches
 from clothjax.types import Array, Body, Garment, Mesh
 
-NEAR = 0.05  # m, body beside the garment
-NEAR_SHARE = 0.05  # of a joint's vertices beside the garment, for the joint to matter
+NEAR = 0.05  # m, distance at which the body is beside the garment
+NEAR_SHARE = 0.05  # share of a joint's vertices beside the garment from which the joint matters
 
 
 class Table(NamedTuple):
@@ -27,8 +27,8 @@ class Scene(NamedTuple):
 
     garment: Garment
     body: Body  # only the vertices that the garment can reach; none where there is no body to touch
-    still: bool  # whether the body never moves
-    mesh: Mesh  # what has energy: of faces, hinges and edges those with a vertex that is not pinned
+    still: bool  # True if the body never moves
+    mesh: Mesh  # elements that have energy: faces, hinges and edges with a vertex that is not pinned
     graph: dict[str, jraph.GraphsTuple]  # `mesh`, and the coarse levels in use: edges sorted by receiver
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]
@@ -37,12 +37,12 @@ class Scene(NamedTuple):
 
     @property
     def touchable(self) -> bool:
-        """Whether there is a body to touch."""
+        """True if there is a body to touch."""
         return self.patches is not None
 
 
 def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
-    """The scene of a garment on a body; deterministic."""
+    """Build the scene of a garment on a body; deterministic."""
     faces = np.asarray(garment.faces)
     used = {name for stack in config.model.processor for name in stack.edges}
     depth = 1 + max((int(name.removeprefix("coarse")) for name in used if name != "mesh"), default=-1)
@@ -73,27 +73,31 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
         graph=graph,
         level=mesh_hierarchy.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
-        patches=patches(within.vertices, within.faces) if touchable else None,
-        garment_patches=patches(garment.vertices, faces),
+        patches=patches(np.asarray(within.vertices), np.asarray(within.faces)) if touchable else None,
+        garment_patches=patches(np.asarray(garment.vertices), faces),
     )
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:
-    """Both directions of undirected edges [E, 2] among V vertices, sorted by receiver, as a graph without features."""
+    """Build a graph without features from undirected edges [E, 2]: both directions, sorted by receiver."""
     senders, receivers = topology.directed(undirected)
     counts = (np.array([n], np.int32) for n in (vertices, len(senders)))
-    return jraph.GraphsTuple(None, None, receivers, senders, None, *counts)
+    # jraph's annotations name JAX arrays only
+    return jraph.GraphsTuple(None, None, receivers, senders, None, *counts)  # pyright: ignore[reportArgumentType]
 
 
 def reachable(body: Body, garment: Garment, reach: float) -> Body:
-    """The part of a body that a garment can touch.
+    """Return the part of a body that a garment can touch.
 
-    Kept are the vertices within `reach` m of the garment, in the canonical pose, of those joints that carry part of
-    the body beside it and, since cloth hangs, of the joints below these. Cutting by joint and far past hem and cuffs
-    matters: the tangent plane at the edge of the cut would act as a wall through the air if a garment vertex ever
-    came nearest to it.
+    It has the vertices within `reach` m of the garment, in the canonical pose, of the joints that matter. Those carry
+    part of the body beside the garment or, since cloth hangs, are below such a joint. The cut is by joint and far past
+    hem and cuffs. Otherwise the tangent plane at its edge would act as a wall through the air for any garment vertex
+    that came nearest to it.
+
+    Raises:
+        ValueError: if no part of the body is near the garment.
     """
-    distance, _ = cKDTree(garment.vertices).query(body.vertices)
+    distance, _ = KDTree(garment.vertices).query(body.vertices)
     joint = np.asarray(body.weights).argmax(axis=1)
     members = np.maximum(np.bincount(joint, minlength=len(body.joints)), 1)
     beside = np.bincount(joint[distance < NEAR], minlength=len(body.joints))
@@ -102,33 +106,36 @@ def reachable(body: Body, garment: Garment, reach: float) -> Body:
     matters |= (parents >= 0) & matters[parents] & (height < height[parents])
     inside = (distance < reach) & matters[joint]
     faces = np.asarray(body.faces)
-    kept_faces = faces[inside[faces].all(axis=1)]
-    if len(kept_faces) == 0:
+    inner_faces = faces[inside[faces].all(axis=1)]
+    if len(inner_faces) == 0:
         raise ValueError(
             f"no part of the body is within {NEAR} m of the garment: they are in different places or units "
             f"(garment {_box(garment.vertices)}, body {_box(body.vertices)})"
         )
-    kept = np.unique(kept_faces)
+    vertices = np.unique(inner_faces)
     renumbered = np.full(len(inside), -1, np.int32)
-    renumbered[kept] = np.arange(len(kept), dtype=np.int32)
-    return _part(body, kept, renumbered[kept_faces])
+    renumbered[vertices] = np.arange(len(vertices), dtype=np.int32)
+    return _part(body, vertices, renumbered[inner_faces])
 
 
 def _bare(body: Body) -> Body:
-    """The rig of a body alone."""
+    """Return the rig of a body without its surface."""
     return _part(body, np.zeros(0, np.int32), np.zeros((0, 3), np.int32))
 
 
-def _part(body: Body, kept: np.ndarray, faces: np.ndarray) -> Body:
+def _part(body: Body, vertices: np.ndarray, faces: np.ndarray) -> Body:
+    """Return a body with some of its vertices, and faces that are numbered among these."""
     return body._replace(
-        vertices=body.vertices[kept],
+        vertices=body.vertices[vertices],
         faces=faces,
-        weights=body.weights[kept],
-        shapedirs=body.shapedirs[kept],
-        posedirs=None if body.posedirs is None else body.posedirs[kept],
+        weights=body.weights[vertices],
+        shapedirs=body.shapedirs[vertices],
+        posedirs=None if body.posedirs is None else body.posedirs[vertices],
     )
 
 
-def _box(vertices: np.ndarray) -> str:
+def _box(vertices: Array) -> str:
+    """Describe the bounding box of vertices for a message."""
+    vertices = np.asarray(vertices)
     low, high = np.min(vertices, axis=0), np.max(vertices, axis=0)
     return f"from {np.round(low, 2).tolist()} to {np.round(high, 2).tolist()} m"

@@ -1,4 +1,4 @@
-"""One time step stated: contact planes, masses, the potential to minimise."""
+"""Statement of one time step: contact planes, masses, the potential to minimise."""
 
 from collections.abc import Callable
 
@@ -11,11 +11,11 @@ from clothjax.physics.incremental_potential import TimeStep
 from clothjax.simulation import characters
 from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.scene import Scene
-from clothjax.types import Array, ClothState
+from clothjax.types import Array, ClothState, Scalar
 
 
 def start(character: Character, window: Window, memory_size: int) -> ClothState:
-    """A garment as skinned at the current frame, moving with the body."""
+    """Return a garment as skinned at the current frame, moving with the body."""
     now = characters.skinned(character, window.current)
     return ClothState(
         position=now,
@@ -27,23 +27,24 @@ def start(character: Character, window: Window, memory_size: int) -> ClothState:
 
 
 def time_step(
-    scene: Scene, character: Character, state: ClothState, window: Window, timestep: Array, config: Config
+    scene: Scene, character: Character, state: ClothState, window: Window, timestep: Scalar, config: Config
 ) -> TimeStep:
-    """The incremental potential's constants for the step from `window.current` to `window.following`."""
+    """Return the potential's constants for the step of `timestep` s from `window.current` to `window.following`."""
     physics = config.physics
     body, body_next = window.current.body, window.following.body
     ahead = state.position + state.velocity
     planes = near = at_edges = on_self = None
-    if scene.touchable and physics.contact_surface == "triangles":
-        planes = contact_search.find(state.position, body, body_next, scene.patches, ahead)
-    elif scene.touchable:
-        planes = contact_search.find_at_centroids(state.position, body, body_next, scene.body.faces)
-    if planes is not None and "friction" not in physics.without:
-        near = incremental_potential.touching(state.position, planes)
-    if planes is not None and physics.edge_contact:
-        at_edges = contact_search.find_at_edges(
-            state.position, planes, scene.mesh, body, body_next, scene.patches, ahead
-        )
+    if scene.patches is not None:
+        if physics.contact_surface == "triangles":
+            planes = contact_search.find(state.position, body, body_next, scene.patches, ahead)
+        else:
+            planes = contact_search.find_at_centroids(state.position, body, body_next, scene.body.faces)
+        if "friction" not in physics.without:
+            near = incremental_potential.touching(state.position, planes)
+        if physics.edge_contact:
+            at_edges = contact_search.find_at_edges(
+                state.position, planes, scene.mesh, body, body_next, scene.patches, ahead
+            )
     if physics.self_contact:
         on_self = contact_search.find_on_self(state.position, scene.garment_patches)
     return TimeStep(
@@ -61,7 +62,7 @@ def time_step(
 
 
 def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
-    """The potential of displacements [V, 3] m of the configured cloth, in the canonical pose and touching nothing."""
+    """Return the potential of displacements [V, 3] m of the configured cloth, without contact in the canonical pose."""
     character = characters.dress(
         scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
     )

@@ -59,9 +59,9 @@ def test_no_joint_turns_much_faster_than_in_the_clips_however_it_is_steered(clip
     products = rotations @ np.swapaxes(rotations, -1, -2)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-5)
     speeds = clips.fps * turning(rotations[1:, 1:], rotations[:-1, 1:])
-    assert (speeds <= motion_matching.FASTEST * clips.fastest[1:] + 1e-2).all()
+    assert (speeds <= motion_matching.TURN_RATE_FACTOR * clips.fastest[1:] + 1e-2).all()
     heading = clips.fps * turning(rotations[1:, 0], rotations[:-1, 0])
-    most = motion_matching.STEER + motion_matching.FASTEST * clips.fastest[0] + np.abs(clips.turn).max()
+    most = motion_matching.STEER + motion_matching.TURN_RATE_FACTOR * clips.fastest[0] + np.abs(clips.turn).max()
     assert heading.max() < most + 1e-2
     assert clips.fps * np.abs(np.diff(places, axis=0)).max() < 6.0
     assert places[:, 1].min() > clips.root[:, 1].min() - 0.1 and places[:, 1].max() < clips.root[:, 1].max() + 0.1

@@ -137,8 +137,8 @@ def test_tables_equal_the_published_tools(tables, case):
     for index, level in enumerate(levels):
         np.testing.assert_array_equal(level.ids, value(f"down{index}_ids"))
         np.testing.assert_array_equal(level.mask, level.ids < inputs)
-        np.testing.assert_array_equal(level.kept, level.ids[:, 0])
-        inputs = len(level.kept)
+        np.testing.assert_array_equal(level.sampled, level.ids[:, 0])
+        inputs = len(level.sampled)
 
 
 def test_all_tables_equal_the_full_golden_file():
@@ -162,19 +162,19 @@ def test_all_tables_equal_the_full_golden_file():
                 # The tool's up table is the transpose of the down table.
                 up = golden[f"S_{case}_up{index}_ids"]
                 reads = [np.flatnonzero((level.ids == v).any(axis=1)).tolist() for v in range(inputs)]
-                assert [row[row < len(level.kept)].tolist() for row in up] == reads
-                inputs = len(level.kept)
+                assert [row[row < len(level.sampled)].tolist() for row in up] == reads
+                inputs = len(level.sampled)
 
 
 @pytest.mark.parametrize("stride, radius", [(1, 1), (2, 2), (2, 1), (3, 2)])
-def test_kept_vertices_are_spaced_and_read_exactly_their_surroundings(stride, radius):
+def test_sampled_vertices_are_spaced_and_read_exactly_their_surroundings(stride, radius):
     faces = np.concatenate([sheet(7, 9), 63 + sheet(5, 5)])
     (level,) = mesh_hierarchy.hierarchy(faces, 90, [stride], [radius])  # two vertices are in no face
     hops = distances(90, topology.edges(faces))
-    between = hops[np.ix_(level.kept, level.kept)]
+    between = hops[np.ix_(level.sampled, level.sampled)]
     assert (between[~np.eye(len(between), dtype=bool)] >= stride).all()
-    assert (hops[:, level.kept].min(axis=1) < stride).all()
-    for centre, ids, mask in zip(level.kept, level.ids, level.mask):
+    assert (hops[:, level.sampled].min(axis=1) < stride).all()
+    for centre, ids, mask in zip(level.sampled, level.ids, level.mask):
         assert set(ids[mask].tolist()) == set(np.flatnonzero(hops[centre] <= radius).tolist())
         assert (ids[~mask] == 90).all() and (np.diff(hops[centre, ids[mask]]) >= 0).all()
 
