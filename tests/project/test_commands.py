@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from samples import ROOT
 
 from clothjax import __main__ as clothjax_main
 from clothjax import cli
@@ -170,5 +171,5 @@ def test_training_needs_a_file_or_a_garment(monkeypatch):
 def test_the_installed_command_is_the_entry():
     import tomllib
 
-    with open(os.path.join(os.path.dirname(__file__), os.pardir, "pyproject.toml"), "rb") as file:
+    with (ROOT / "pyproject.toml").open("rb") as file:
         assert tomllib.load(file)["project"]["scripts"] == {"clothjax": "clothjax.__main__:main"}

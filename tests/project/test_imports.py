@@ -20,7 +20,7 @@ HOST = {  # NumPy only
 # from the ground up: a folder may import those before it
 FLOORS = (
     "types config progress material geometry body files physics simulation networks training runtime export render "
-    "evaluation commands cli doctor __main__"
+    "evaluation cli commands doctor __main__"
 ).split()
 # what may never reach what, by any chain of imports
 NEVER = {
