@@ -75,7 +75,7 @@ def library(
     for name, clip in clips.items():
         if clip.fps != fps or len(clip.rotations) < fps:
             raise ValueError(
-                f"{name} has {len(clip.rotations)} frames at {clip.fps} a second; a second at {fps} is least"
+                f"{name} has {len(clip.rotations)} frames at {clip.fps} a second; it needs at least a second at {fps}"
             )
         parts.append(_frames(clip, positions, feet))
         parts[-1]["family"] = np.full(len(clip.rotations), families.index(_family(name)))

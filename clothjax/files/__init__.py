@@ -1,1 +1,1 @@
-"""What is on disk: assets, configurations, checkpoints; checked when read."""
+"""Files on disk: assets, configurations, checkpoints; checked when read."""

@@ -73,7 +73,7 @@ def save(directory: str | Path, step: int, state: Any, config: dict, description
             parts = ocp.args.Composite(state=ocp.args.PyTreeSave(arrays), about=ocp.args.JsonSave(about))
             manager.save(step, args=parts)
     except Exception as error:  # Orbax raises many kinds for a disk that is full, slow or gone
-        before = f"step {existing[-1]} is whole" if existing else "there is none before it"
+        before = f"step {existing[-1]} is complete" if existing else "there is none before it"
         raise OSError(
             f"{directory}: the checkpoint of step {step} could not be written ({before}): make room, and run the same "
             f"command again ({_first_line(error)})"

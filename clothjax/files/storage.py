@@ -435,7 +435,7 @@ def _refuse_joints(file: h5py.File, names: tuple[str, ...], wanted: tuple[str, .
     """Raise a ValueError that lists how the joints of a motion differ from the body's."""
     lacking = [n for n in wanted if n not in names]
     further = [n for n in names if n not in wanted]
-    text = f"lacks {lacking}, has {further} besides" if lacking or further else f"has another order, {list(names)}"
+    text = f"lacks {lacking} and also has {further}" if lacking or further else f"has another order, {list(names)}"
     raise ValueError(f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)")
 
 

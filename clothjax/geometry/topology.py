@@ -15,9 +15,9 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
         vertex_count: V, by default the highest index plus one.
 
     Returns:
-        Mesh with hinges [H, 4], sorted by edge. A hinge is the edge (a, b) as directed in its left face, then the
-        vertices opposite it in the left and in the right face. The left face is the first of the two in `faces`.
-        An edge of three or more faces makes one hinge of the first two, as in HOOD (Grigorev et al. 2023).
+        Mesh with hinges [H, 4], sorted by edge. A hinge has the edge (a, b) as directed in its left face, then the
+        vertices opposite it in the left and in the right face. The left face is the first of the two in `faces`. An
+        edge of three or more faces makes one hinge of the first two, as in HOOD (Grigorev et al. 2023).
 
     Raises:
         ValueError: if an index is out of range, a face has a vertex twice, or the array is not [F, 3] of integers.

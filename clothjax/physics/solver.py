@@ -15,7 +15,7 @@ import scipy.sparse
 from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search, energies, incremental_potential
 from clothjax.physics.incremental_potential import LAWS, Laws, TimeStep
-from clothjax.types import Array, Mesh
+from clothjax.types import Array, Mesh, Scalar
 
 VERTEX_TERMS = ("gravity", "inertia", "friction", "collision")
 CG_ITERATIONS = 600
@@ -308,10 +308,10 @@ def _check(x: np.ndarray, step: TimeStep) -> None:
         )
 
 
-def to_float64(leaf: Array) -> np.ndarray:
-    """Convert an array of floats to float64; return any other as it is."""
-    leaf = np.asarray(leaf)
-    return leaf.astype(np.float64) if np.issubdtype(leaf.dtype, np.floating) else leaf
+def to_float64(leaf: Array | Scalar) -> np.ndarray:
+    """Convert floats to an array of float64; return other arrays with their dtype."""
+    array = np.asarray(leaf)
+    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
 
 
 def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
