@@ -11,10 +11,17 @@ from clothjax.types import Array
 
 
 class Table(Protocol):
-    """The neighbours of a block: which of N inputs each of P outputs reads, as in `mesh_hierarchy.Level`."""
+    """The neighbours of a block: the inputs, of N, that each of P outputs reads, as in `mesh_hierarchy.Level`."""
 
-    ids: Array  # [P, K] int32; padding is any number
-    mask: Array  # [P, K] bool, false at padding, which then has no effect and no gradient
+    @property
+    def ids(self) -> Array:
+        """[P, K] int32; padding is any number."""
+        ...
+
+    @property
+    def mask(self) -> Array:
+        """[P, K] bool, false at padding, which has no effect and no gradient."""
+        ...
 
 
 class MeshConvolution(nn.Module):
@@ -39,10 +46,10 @@ class MeshConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, table: Table) -> Array:
-        """[P, O] features of x [N, I].
+        """Return features [P, O] of x [N, I].
 
         Raises:
-            ValueError: a rate outside [0, 1].
+            ValueError: if `residual_rate` is outside [0, 1].
         """
         rate, inputs, outputs = self.residual_rate, x.shape[-1], self.features
         if not 0 <= rate <= 1:
@@ -50,7 +57,7 @@ class MeshConvolution(nn.Module):
         ids = jnp.where(table.mask, table.ids, 0)
         weights = jnp.asarray(table.mask, x.dtype)
         normal = nn.initializers.normal
-        out = 0.0
+        out = jnp.zeros(())
         if rate < 1:
 
             def coefficient(key, shape):
@@ -85,16 +92,17 @@ class Convolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, tables: Sequence[Table]) -> Array:
-        """Features [P, O] of the last block of x [N, I]; each block has its own table."""
+        """Return features [P, O] of the last block of x [N, I]; each block has its own table."""
         for index, (features, table) in enumerate(zip(self.features, tables, strict=True)):
             x = MeshConvolution(features, self.bases, name=str(index))(x, table)
         return x
 
 
 def _convolve(basis: Array, coefficients: Array, x: Array, ids: Array) -> Array:
-    """[P, O] of basis [I, M, O], masked coefficients [P, K, M], inputs [N, I] and neighbours [P, K]."""
+    """Convolve inputs [N, I] to [P, O] by a basis [I, M, O], masked coefficients [P, K, M] and neighbours [P, K]."""
     features, bases, outputs = basis.shape
-    if _basis_first(x.shape[0], *ids.shape, features, outputs, bases):
+    places, slots = ids.shape
+    if _basis_first(len(x), places, slots, features, outputs, bases):
         transformed = (x @ basis.reshape(features, -1)).reshape(-1, bases, outputs)
         return jnp.einsum("pkmo,pkm->po", _gather(transformed, ids), coefficients)
     # This order of operands, with M innermost, is the fastest of those tried under vmap on a CPU.
@@ -103,7 +111,7 @@ def _convolve(basis: Array, coefficients: Array, x: Array, ids: Array) -> Array:
 
 
 def _basis_first(inputs: int, outputs: int, slots: int, features: int, channels: int, bases: int) -> bool:
-    """Whether to transform all inputs before gathering them: narrow last blocks, where it is far cheaper."""
+    """Return whether it is far cheaper to transform all inputs before gathering them, as in narrow last blocks."""
     gather_first = outputs * slots * bases * features + outputs * bases * features * channels
     basis_first = inputs * bases * features * channels + outputs * slots * bases * channels
     return 2 * basis_first <= gather_first and bases * channels <= features

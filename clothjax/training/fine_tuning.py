@@ -37,7 +37,7 @@ def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.
     """The state before the first step."""
     key, pool_key = jax.random.split(jax.random.key(config.tuning.seed))
     clips = jax.tree.map(jnp.asarray, clips)
-    return stage1.starting(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
+    return stage1.initial_state(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
 
 
 def pose_preconditioner(poses: np.ndarray, power: float) -> Array:

@@ -184,7 +184,7 @@ def train_baseline(run: Run) -> dict[str, float]:
     progress.say(f"{name} on the physics, {config.stage1.steps} steps")
     animator = animators.baseline_animator(joints)
     update = stage1.make_curriculum(scene, run.clips, config, STEPS_PER_CALL, run.device_mesh, animator)
-    state = stage1.init_peer(scene, run.clips, joints, shapes, config)
+    state = stage1.init_baseline(scene, run.clips, joints, shapes, config)
     fitted = _fit(run, "stage1", update, state, config.stage1.steps, f"{name}, {config.garment}", "baseline")
     return {"stage1_seconds": fitted.seconds, "compile_seconds": fitted.compile_seconds}
 
