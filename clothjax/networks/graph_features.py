@@ -5,6 +5,7 @@ Nothing here changes when the scene is moved, or turned about the vertical.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from clothjax.body import skinning
@@ -32,7 +33,7 @@ class Features(NamedTuple):
     """Raw inputs of the encoders."""
 
     nodes: Array  # [V, N]
-    edges: dict[str, Array]  # [E, M] by edge set
+    edges: dict[str, jax.Array]  # [E, M] by edge set
     world: WorldFeatures | None  # None where there is no body
 
     def columns(self) -> dict[str, list[Array]]:
@@ -178,7 +179,7 @@ def _canonical(
     return jnp.concatenate(columns, axis=-1), drifted
 
 
-def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
+def mesh_edges(senders, receivers, points, template, turn, timestep, inputs) -> jax.Array:
     """Compute features of edges: relative positions now and at rest, [E, 12], and the strain of each guess.
 
     Args:

@@ -28,7 +28,7 @@ from clothjax.training.pool import Simulation, begin, dressed
 from clothjax.types import Array, ClothState
 
 NORMALIZER_STEPS = 2000  # over which the feature statistics are collected; then they are frozen
-FARTHEST = 5.0  # m from the root, where cloth counts as lost
+MAX_DISTANCE = 5.0  # m from the root, where cloth counts as lost
 
 
 class TrainingState(NamedTuple):
@@ -284,7 +284,7 @@ def batch_gradient(
 
 def reset_mask(cloth: ClothState, losses: Array, stage: Stage1Config) -> Array:
     """Return which simulations [B] are lost: too far away, of too large a loss, or not finite in either."""
-    lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < FARTHEST)
+    lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < MAX_DISTANCE)
     return lost | ~(losses < (jnp.inf if stage.lost is None else stage.lost))
 
 
