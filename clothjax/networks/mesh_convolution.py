@@ -30,12 +30,12 @@ class MeshConvolution(nn.Module):
     The convolution is b + sum_k x[ids[p, k]] (sum_m a[p, k, m] W[m]). The residual pools the neighbours with
     weights |density| that sum to one, if P != N, and maps channels, if I != O.
 
-    Initial values keep the mean square of the features through a block with ReLU, if neighbours resemble each
-    other. The paper's, N(0, 1) for `basis`, N(0, 1) / (mean count M) for `coefficients` and N(0, 1) / O for
-    `skip`, do not: from 128 to 256 features the skip leaves less than a twentieth, and stacked blocks fade.
+    Initial values preserve the mean square of the features through a block with ReLU, if neighbours resemble each
+    other. The paper has N(0, 1) for `basis`, N(0, 1) / (mean count M) for `coefficients` and N(0, 1) / O for `skip`.
+    With these, a skip from 128 to 256 features leaves less than a twentieth, and stacked blocks fade.
 
-    Parameters are `basis` [I, M, O], `coefficients` [P, K, M] and `bias` [O] if r < 1; `density` [P, K] if r > 0 and
-    P != N; `skip` [I, O] if r > 0 and I != O.
+    Parameters if r < 1: `basis` [I, M, O], `coefficients` [P, K, M] and `bias` [O]. Parameters if r > 0: `density`
+    [P, K] if P != N, and `skip` [I, O] if I != O.
     """
 
     features: int  # channels O

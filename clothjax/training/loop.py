@@ -59,9 +59,9 @@ def fit(
 ) -> Fitted:
     """Train to `steps`, from the directory's newest checkpoint if there is one.
 
-    The directory gets `checkpoints/`, `metrics.jsonl` (one line a call: the median of every metric, its
-    maximum as `<name>_max`, the number of `nonfinite` steps, what `evaluate` returns) and `training.json`
-    (steps and seconds). The training depends on nothing but the state: a run that is stopped at any moment and
+    The directory gets `checkpoints/`, `metrics.jsonl` and `training.json` (steps and seconds). A line of the metrics
+    is a call: the median of every metric, its maximum as `<name>_max`, the number of `nonfinite` steps, the figures of
+    `evaluate`. The training depends on nothing but the state: a run that is stopped at any moment and
     resumed ends bit for bit as one that was not.
 
     Args:
@@ -73,7 +73,8 @@ def fit(
         description: one line for a person, stored there too.
         may_differ: dotted names in `config` whose values may change between the sessions of a run.
         evaluate: a function that returns figures of a state; called about every `evaluate_steps` steps.
-        checkpoint_seconds: between two checkpoints, of which `keep` are kept; there is always one at the end.
+        checkpoint_seconds: between two checkpoints; there is always one at the end.
+        keep: number of checkpoints that stay.
         report_seconds: between two lines where there is no terminal to show a bar on.
         max_nonfinite: skipped steps in a row that are tolerated.
 

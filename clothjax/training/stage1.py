@@ -174,7 +174,7 @@ def rollout_length(step: int, config: Config) -> int:
 
 
 class Problem(NamedTuple):
-    """What stays fixed over the steps of a training."""
+    """Constants of a training: the same at every step."""
 
     scene: Scene
     config: Config
@@ -218,7 +218,7 @@ def make_update(
     It consumes its argument (buffers are donated). The simulations of a batch are spread over the devices.
 
     Args:
-        animator: what is trained, made of its `params` and `statistics`.
+        animator: makes what is trained, of its `params` and `statistics`.
     """
     problem = Problem(scene, config, frames, optimizer(config), animator, device_mesh)
     return loop.scan_steps(partial(train_step, problem), clips, steps, device_mesh)

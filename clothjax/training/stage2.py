@@ -42,7 +42,7 @@ class TrainingState(NamedTuple):
     optimizer: optax.OptState
     normalizers: Normalizers
     metric: Array  # [K, K] the mean squared vertex error of blend-weight errors, over the vertices' variance
-    garment: dict  # the frozen decoder and blend shapes: with them, a checkpoint is a whole Psi
+    garment: dict  # the frozen decoder and blend shapes; with them, a checkpoint is a complete Psi
 
 
 def make_rollout(scene: Scene, input_joints: np.ndarray, config: Config) -> Callable:
