@@ -111,7 +111,7 @@ def _again(
         state = fine_tuning.init(predictor, experiment.scene, reel, experiment.config)
     elif config.peer.network:
         animator = animators.baseline_animator(kept)
-        state = stage1.init_peer(
+        state = stage1.init_baseline(
             experiment.scene, reel, kept, laplacian_shapes.laplacian(experiment.scene, config), config
         )
     else:
@@ -119,7 +119,7 @@ def _again(
 
     @partial(jax.jit, static_argnums=2)
     def turn(state: stage1.TrainingState, reel: Clips, frames: int):
-        return stage1.turn(state, experiment.scene, reel, frames, config)
+        return stage1.next_batch(state, experiment.scene, reel, frames, config)
 
     update = stage1.make_curriculum(experiment.scene, reel, config, 1, None, animator)
     return update, lambda state: turn(state, reel, stage1.rollout_length(int(state.step), config)), state

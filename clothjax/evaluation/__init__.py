@@ -1,1 +1,1 @@
-"""How good a run is: rollouts, measures against the reference solver, pictures."""
+"""Evaluation of a run: rollouts, measures against the reference solver, pictures."""

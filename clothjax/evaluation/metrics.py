@@ -1,11 +1,11 @@
-"""How good a trajectory is, judged by the reference solver from the trajectory's own states.
+"""Measures of a trajectory, by the reference solver from the trajectory's own states.
 
 A trajectory is [T + 1, V, 3] m: the garment at every frame, relative to the root's translation at that frame.
-Nothing is borrowed from the solver between frames, so trajectories on different branches of a history-dependent
-motion are judged alike.
+The solver starts every step from the trajectory. Therefore trajectories on different branches of a history-dependent
+motion are measured alike.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import igl
@@ -24,17 +24,17 @@ from clothjax.simulation.reference import problem
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array, Body, Pose
 
-SPAN_STEPS, SPAN_BOUND = 100, 1.0  # of the search for the minimum in the span of the blend shapes; m
+SPAN_STEPS, SPAN_BOUND = 100, 1.0  # steps, and m a step, of the search in the span of the blend shapes
 
 
 class StepMeasure(NamedTuple):
-    """One step of a trajectory against the best it could have been, from the same two previous frames."""
+    """Energies of one step of a trajectory, and of other steps from the same two previous frames."""
 
     energy: float  # J, of the step taken
     minimum: float  # J, the reference solver's
     skinned: float  # J, of skinning
-    hold: float  # J, of keeping the last canonical displacement
-    span: float  # J, the least that some blend shapes can reach; NaN without any
+    hold: float  # J, of persistence: the last canonical displacement again
+    span: float  # J, the least in the span of the blend shapes; NaN without any
     error: np.ndarray  # [V] m, distance of each vertex to the minimum
     converged: bool
 
@@ -44,23 +44,23 @@ def step_measures(
     character: Character,
     trajectory: Array,
     poses: Pose,
-    frames: Array,
+    frames: Sequence[int] | np.ndarray,
     config: Config,
     blendshapes: Array | None = None,
 ) -> list[StepMeasure]:
-    """The steps of a trajectory that leave the given frames, each solved anew.
+    """Measure the steps of a trajectory that leave the given frames, each solved anew.
 
     Args:
         trajectory: [T + 1, V, 3] m, relative to the root.
-        poses: windows [T + 1, 3, ...] of `clips.poses`, one a frame.
+        poses: windows [T + 1, 3, ...] of `motion_clips.poses`, one a frame.
         frames: from 1 to T - 1.
-        blendshapes: [K, V, 3] m, whose span is searched too.
+        blendshapes: [K, V, 3] m; their span is searched too.
     """
     state = problem(scene, config)
     search = None if blendshapes is None else _search_span(scene, character, blendshapes, config)
 
     def energy(new: Array, step: TimeStep) -> float:
-        # float64 on the host, as the solver has it: differences of energies are small
+        # float64 on the host, as in the solver: differences of energies are small
         with jax.enable_x64(True):
             step = jax.tree.map(solver.to_float64, step)
             return float(_potential(np.asarray(new, np.float64), step, scene.mesh, config.physics))
@@ -68,24 +68,34 @@ def step_measures(
     measures = []
     for frame in frames:
         around = jax.tree.map(lambda x, t=frame: x[t], poses)
-        step, skinned, held, advance = state(character, trajectory[frame - 1], trajectory[frame], around)
+        step, skinned, persistent, advance = state(character, trajectory[frame - 1], trajectory[frame], around)
         new = trajectory[frame + 1] + advance[None]
-        taken, kept = energy(new, step), energy(held, step)
         # two starts, the better end: folds have many minima
         ends = [
-            solver.solve_step(begin, step, scene.mesh, scene.garment.pinned, config.physics) for begin in (new, held)
+            solver.solve_step(begin, step, scene.mesh, scene.garment.pinned, config.physics)
+            for begin in (new, persistent)
         ]
         best, info = min(ends, key=lambda end: (not end[1].converged, end[1].energy))
         error = np.linalg.norm(best - np.asarray(new, np.float64), axis=-1)
         span = np.nan
         if search is not None:
             span = min(energy(x, step) for x in (search(begin, step, around) for begin in (new, best)))
-        measures.append(StepMeasure(taken, info.energy, energy(skinned, step), kept, span, error, info.converged))
+        measures.append(
+            StepMeasure(
+                energy=energy(new, step),
+                minimum=info.energy,
+                skinned=energy(skinned, step),
+                hold=energy(persistent, step),
+                span=span,
+                error=error,
+                converged=info.converged,
+            )
+        )
     return measures
 
 
 def _search_span(scene: Scene, character: Character, blendshapes: Array, config: Config) -> Callable:
-    """A function that brings a garment [V, 3] m into the span of blend shapes and down to the minimum there."""
+    """Return a function that projects a garment [V, 3] m to the span of blend shapes and finds the minimum there."""
     free = np.where(np.asarray(scene.garment.pinned), 0.0, 1.0)[:, None]
     shapes = (np.asarray(blendshapes, np.float64) * free).reshape(len(blendshapes), -1)
     _, sizes, vectors = np.linalg.svd(shapes, full_matrices=False)
@@ -118,12 +128,12 @@ def _search_span(scene: Scene, character: Character, blendshapes: Array, config:
 
 
 def gaps(measures: list[StepMeasure]) -> dict[str, float]:
-    """`energy_gap`, `hold_gap` and `step_error_mm` of steps: means, with medians and maxima beside them.
+    """Compute `energy_gap`, `hold_gap` and `step_error_mm` of steps: means, medians and maxima.
 
-    energy_gap = (E - E_min) / (E_skinned - E_min): 0 the solver, 1 plain skinning. hold_gap puts E_hold in the place
-    of E_skinned: 1 no dynamics at all; span_gap puts the minimum in the span of the blend shapes in the place of E
-    there. All means are ratios of summed energies, so that a frame whose garment hardly moves does not outweigh the
-    others; the medians are of single frames.
+    energy_gap = (E - E_min) / (E_skinned - E_min): 0 for the solver, 1 for plain skinning. hold_gap, the persistence
+    gap, has E_hold in the place of E_skinned: 1 for no dynamics at all. span_gap is the hold_gap of the minimum in the
+    span of the blend shapes. Means are ratios of summed energies, so a frame whose garment hardly moves does not
+    outweigh the others; medians are of single frames.
     """
     taken, minimum, skinned, hold = (
         np.array([getattr(m, name) for m in measures]) for name in ("energy", "minimum", "skinned", "hold")
@@ -147,9 +157,9 @@ def gaps(measures: list[StepMeasure]) -> dict[str, float]:
 
 
 def penetration(garment: np.ndarray, body: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [V] m of garment vertices [V, 3] m inside a closed body [B, 3] m, 0 outside, and the faces [V] nearest.
+    """Find the depth [V] m of garment vertices [V, 3] m in a body [B, 3] m, 0 outside, and the nearest faces [V].
 
-    Inside is by winding number on the whole body, independent of the planes that the collision energy uses.
+    The body is closed. Its winding number decides what is inside, independently of the planes of the collision energy.
     """
     signed, nearest, *_ = igl.signed_distance(
         np.asarray(garment, np.float64),
@@ -157,20 +167,24 @@ def penetration(garment: np.ndarray, body: np.ndarray, faces: np.ndarray) -> tup
         np.asarray(faces, np.int64),
         sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
     )
-    return np.maximum(-signed, 0.0), nearest
+    return np.maximum(-np.asarray(signed), 0.0), np.asarray(nearest)
 
 
 def penetrations(
-    scene: Scene,
     body: Body,
     betas: Array,
     trajectory: Array,
     poses: Pose,
-    frames: Array,
+    frames: Sequence[int],
     names: tuple[str, ...],
 ) -> dict:
-    """`penetration_percent`: mean, median and maximum over frames; `penetration_max_mm`: the deepest vertex; and
-    `penetration_by_joint`: the mean percentage of the garment that is inside where each joint moves the body most."""
+    """Measure how much of a garment is inside the body.
+
+    Returns:
+        `penetration_percent`: mean, median and maximum over frames. `penetration_max_mm`: the deepest vertex.
+        `penetration_by_joint`: the mean percentage of the garment inside the part of the body that each joint moves
+        most.
+    """
     vertices = skinning.shaped_vertices(body, betas)
     joints = skinning.shaped_joints(body, betas)
 
@@ -179,24 +193,24 @@ def penetrations(
         return skinning.pose_body(body, vertices, joints, Pose(rotations, jnp.zeros(3)))
 
     moved_by = np.asarray(body.weights)[np.asarray(body.faces)[:, 0]].argmax(axis=1)
-    percent, deepest, where = [], 0.0, np.zeros(len(names))
+    percent, deepest, by_joint = [], 0.0, np.zeros(len(names))
     for t in frames:
-        depth, nearest = penetration(trajectory[t], posed(poses.rotations[t, 1]), body.faces)
+        depth, nearest = penetration(np.asarray(trajectory[t]), posed(poses.rotations[t, 1]), np.asarray(body.faces))
         percent.append(100.0 * np.mean(depth > 0))
         deepest = max(deepest, depth.max())
-        where += np.bincount(moved_by[nearest[depth > 0]], minlength=len(names))
-    where = 100.0 * where / (len(percent) * trajectory.shape[1])
+        by_joint += np.bincount(moved_by[nearest[depth > 0]], minlength=len(names))
+    by_joint = 100.0 * by_joint / (len(percent) * trajectory.shape[1])
     return {
         "penetration_percent": float(np.mean(percent)),
         "penetration_percent_median": float(np.median(percent)),
         "penetration_percent_max": float(np.max(percent)),
         "penetration_max_mm": 1e3 * float(deepest),
-        "penetration_by_joint": {name: float(share) for name, share in zip(names, where) if share > 0},
+        "penetration_by_joint": {name: float(share) for name, share in zip(names, by_joint, strict=True) if share > 0},
     }
 
 
 def edge_strain(scene: Scene, character: Character, trajectory: Array) -> dict[str, float]:
-    """`edge_strain_p95` and `edge_strain_max` of |l / l_0 - 1| over all edges and frames."""
+    """Compute `edge_strain_p95` and `edge_strain_max` of |l / l_0 - 1| over all edges and frames."""
     edges = topology.edges(np.asarray(scene.garment.faces))
     trajectory, template = np.asarray(trajectory, np.float64), np.asarray(character.template, np.float64)
 
@@ -208,15 +222,15 @@ def edge_strain(scene: Scene, character: Character, trajectory: Array) -> dict[s
 
 
 def beside_solver(scene: Scene, trajectory: Array, solved: Array, skinned: Array) -> dict[str, float]:
-    """How a trajectory compares with the reference solver's own rollout, frame by frame.
+    """Compare a trajectory with the reference solver's own rollout, frame by frame.
 
     Args:
         trajectory, solved, skinned: [T, V, 3] m at the same frames, relative to the root.
 
     Returns:
-        `swing_ratio`, the rms velocity of what skinning does not do, over the solver's, and `swing_correlation` of the
-        two; `rollout_error_mm`, the mean distance of vertices; `wrinkle_ratio`, the rms dihedral angle over the
-        solver's.
+        `swing_ratio` (dynamics ratio): the rms velocity relative to skinning, over the solver's; `swing_correlation` of
+        these two velocities; `rollout_error_mm`, the mean distance of vertices; `wrinkle_ratio`, the rms dihedral angle
+        over the solver's.
     """
     one, other, plain = (np.asarray(x, np.float64) for x in (trajectory, solved, skinned))
     swing, reference = (np.diff(x - plain, axis=0) for x in (one, other))
@@ -232,10 +246,11 @@ def beside_solver(scene: Scene, trajectory: Array, solved: Array, skinned: Array
 
 
 def roughness(trajectory: Array, advance: Array) -> float:
-    """Rms of the second time difference of vertex accelerations, in m/frame^4; the numerator of `jitter`.
+    """Compute the rms of the second time difference of vertex accelerations, in m/frame^4: the numerator of `jitter`.
 
     Args:
-        trajectory: [T, V, 3] m relative to the root; advance: [T - 1, 3] m, the root's steps between its frames.
+        trajectory: [T, V, 3] m relative to the root.
+        advance: [T - 1, 3] m, the root's steps between its frames.
     """
     world = np.asarray(trajectory, np.float64)
     moved = np.concatenate([np.zeros((1, 3)), np.cumsum(np.asarray(advance, np.float64), axis=0)])
@@ -243,7 +258,7 @@ def roughness(trajectory: Array, advance: Array) -> float:
 
 
 def distance_mm(one: Array, other: Array) -> np.ndarray:
-    """Mean vertex distance in mm of each frame of two trajectories [T, V, 3] m: [T]."""
+    """Compute the mean vertex distance [T] in mm of each frame of two trajectories [T, V, 3] m."""
     return 1e3 * np.linalg.norm(np.asarray(one, np.float64) - np.asarray(other, np.float64), axis=-1).mean(-1)
 
 

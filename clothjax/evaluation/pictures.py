@@ -1,6 +1,6 @@
 """Trajectories as labelled grids of pictures and as animation files."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -27,12 +27,12 @@ GALLERY_SIZE = (240, 480)
 
 
 def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Rows of pictures by method, and a label for each column."""
+    """Render rows of pictures by method, and a label for each column."""
     experiment, phi = load_run(run)
     config = experiment.config
-    wearers = assembly.wearers(experiment)
+    people = assembly.wearers(experiment)
     play = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, experiment, c, p))
-    at = frame - 1  # trajectories start at a clip's second frame
+    index = frame - 1  # trajectories start at a clip's second frame
     rows, columns = {"Phi": [], "Psi": [], "solver": []}, []
     with progress_bar("simulating", len(motions) * len(GALLERY_BODIES)) as report:
         for motion in motions:
@@ -42,7 +42,7 @@ def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[n
             clip = Motion(clip.rotations[: frame + 2], clip.translation[: frame + 2], clip.fps)
             poses = windows(clip)
             for shape in GALLERY_BODIES:
-                betas, material = wearers[f"{shape}, {GALLERY_CLOTH}"]
+                betas, material = people[f"{shape}, {GALLERY_CLOTH}"]
                 character = assembly.dress(experiment, betas, material)
                 tracks = {
                     "Phi": np.asarray(play(phi, character, poses)),
@@ -50,10 +50,10 @@ def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[n
                     "solver": reference.simulate(experiment.scene, character, poses, config)[0],
                 }
                 body, root = body_trajectory(experiment, clip, betas)
-                camera = ray_cast.camera_for(body[at : at + 1])
-                floor = float((body + root[:, None])[..., 1].min() - root[at, 1])
+                camera = ray_cast.camera_for(body[index : index + 1])
+                floor = float((body + root[:, None])[..., 1].min() - root[index, 1])
                 for name, track in tracks.items():
-                    surfaces = dressed(experiment, body[at], track[at])
+                    surfaces = dressed(experiment, body[index], track[index])
                     rows[name].append(ray_cast.render(surfaces, camera, GALLERY_SIZE, floor=floor))
                 columns.append(f"{Path(motion).stem}, {shape}")
                 report(len(columns))
@@ -65,36 +65,40 @@ SIZE = (360, 480)
 
 
 def perform(run: Path, experiment: Experiment, motion: str, frames: int) -> Performance:
-    """Psi on the body over the frames of a clip, or alone where the scene has no body."""
+    """Return Psi's garment over the first frames of a clip, on the body if the scene has one."""
     clip = assembly.motion(experiment, motion)
     garment = psi_trajectory(inference.load(run, betas=assembly.betas(experiment.config)), clip)[:frames]
     body, root = body_trajectory(experiment, clip)
     parts = (
-        Part("body", body[:frames], experiment.body.faces, SKIN),
-        Part("garment", garment, experiment.garment.faces, CLOTH),
+        Part("body", body[:frames], np.asarray(experiment.body.faces), SKIN),
+        Part("garment", garment, np.asarray(experiment.garment.faces), CLOTH),
     )
     return Performance(parts if experiment.scene.touchable else parts[1:], root[:frames], clip.fps)
 
 
 def film(write: Callable) -> Callable:
-    """A writer of a performance from one of pictures and frames a second; the camera goes along, but does not bob."""
+    """Return a writer of performances from a writer of pictures. The camera follows the root, but not up and down.
 
-    def written(out: Path, shown: Performance) -> None:
+    Args:
+        write: takes a path, pictures and frames a second.
+    """
+
+    def write_film(out: Path, shown: Performance) -> None:
         tracks = [np.asarray(part.vertices) + shown.root[:, None] * [0.0, 1.0, 0.0] for part in shown.parts]
         floor, camera = float(tracks[0][..., 1].min()), ray_cast.camera_for(shown.parts[0].vertices)
         pictures = []
         with progress_bar("rendering", len(shown.root)) as report:
             for t in range(len(shown.root)):
-                surfaces = [Surface(x[t], part.faces, part.colour) for x, part in zip(tracks, shown.parts)]
+                surfaces = [Surface(x[t], part.faces, part.colour) for x, part in zip(tracks, shown.parts, strict=True)]
                 pictures.append(ray_cast.render(surfaces, camera, SIZE, floor=floor))
                 report(t + 1)
         write(out, pictures, shown.fps)
 
-    return written
+    return write_film
 
 
 def write_comparison(run: Path, experiment: Experiment, motion: str, out: Path) -> None:
-    """Skinning, Phi, Psi and the reference solver at the same moments of a measured clip."""
+    """Write pictures of skinning, Phi, Psi and the reference solver at the same moments of a measured clip."""
     tracks = Tracks.load(run, motion)
     shown = {label: tracks.stages[name] for name, label in ROWS.items()} | {"reference solver": tracks.solver}
     rows, columns = at_moments(experiment, motion, shown)
@@ -103,13 +107,13 @@ def write_comparison(run: Path, experiment: Experiment, motion: str, out: Path) 
 
 def at_moments(
     experiment: Experiment, motion: str, tracks: dict[str, np.ndarray], count: int = 5
-) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Rows of pictures of trajectories [T, V, 3] m over a clip at the same moments, and a label for each column."""
+) -> tuple[dict[str, Sequence[np.ndarray]], list[str]]:
+    """Render rows of pictures of trajectories [T, V, 3] m over a clip at the same moments; also label each column."""
     body, root = body_trajectory(experiment, assembly.motion(experiment, motion))
     moments = np.linspace(0, min(map(len, tracks.values())) - 1, count + 1)[1:].astype(int)
     floor = float((body + root[:, None])[moments][..., 1].min())
     camera = ray_cast.camera_for(body[moments])
-    rows = {
+    rows: dict[str, Sequence[np.ndarray]] = {
         label: [
             ray_cast.render(dressed(experiment, body[t], track[t]), camera, SIZE, floor=floor - float(root[t, 1]))
             for t in moments
@@ -122,14 +126,17 @@ def at_moments(
 def body_trajectory(
     experiment: Experiment, clip: Motion, betas: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The whole body [T - 2, B, 3] m at the frames that are measured, relative to its root [T - 2, 3] m.
+    """Pose the complete body [T - 2, B, 3] m at the measured frames, relative to its root; also return the root.
 
     Args:
         betas: [S]; default: those of evaluation.
+
+    Returns:
+        The body's vertices, and the root's positions [T - 2, 3] m.
     """
-    betas = jnp.asarray(assembly.betas(experiment.config) if betas is None else betas)
-    vertices = skinning.shaped_vertices(experiment.body, betas)
-    joints = skinning.shaped_joints(experiment.body, betas)
+    shape = jnp.asarray(assembly.betas(experiment.config) if betas is None else betas)
+    vertices = skinning.shaped_vertices(experiment.body, shape)
+    joints = skinning.shaped_joints(experiment.body, shape)
 
     @jax.jit
     def posed(rotations):
@@ -141,9 +148,9 @@ def body_trajectory(
 
 
 def dressed(experiment: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
-    """The surfaces of a garment on a body, or of the garment alone where the scene has no body."""
-    cloth = [Surface(garment, experiment.garment.faces)]
-    return [Surface(body, experiment.body.faces, SKIN), *cloth] if experiment.scene.touchable else cloth
+    """Return the surfaces of a garment on a body, or of the garment alone if the scene has no body."""
+    cloth = [Surface(garment, np.asarray(experiment.garment.faces))]
+    return [Surface(body, np.asarray(experiment.body.faces), SKIN), *cloth] if experiment.scene.touchable else cloth
 
 
 WRITERS = {

@@ -35,17 +35,18 @@ CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, 
 
 
 def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
-    """The report of each garment under its name, and under `mean` the means of the stages that all have."""
+    """Evaluate models: a report under each name, and under `mean` the means of the stages that all of them have."""
     if not folders:
         raise ValueError("no garments come with this clothjax; train one with `python -m clothjax train`")
     reports = {}
     for name, folder in folders.items():
-        there = motions
-        if there is None:
+        present = motions
+        if present is None:
             wanted = trained.network(folder)[0].evaluation.motions
-            there = [motion for motion in wanted if storage.asset(motion).is_file()]
-            print(f"{name}: on {', '.join(there)}", *(f"({motion} is not here)" for motion in set(wanted) - set(there)))
-        reports[name] = evaluate(folder, there)
+            present = [motion for motion in wanted if storage.asset(motion).is_file()]
+            absent = set(wanted) - set(present)
+            print(f"{name}: on {', '.join(present)}", *(f"({motion} is not here)" for motion in absent))
+        reports[name] = evaluate(folder, present)
     first, *others = (report["evaluation"] for report in reports.values())
     stages = [stage for stage in first if all(stage in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
@@ -53,10 +54,13 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) 
 
 
 def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None) -> dict:
-    """The measures of a run, under `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`.
+    """Measure a run; results are in `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`.
 
     Args:
         settings: default: those that the run was trained with.
+
+    Raises:
+        ValueError: if there is no motion to measure on.
     """
     experiment, model = load_run(run, settings, trained.network)
     output_folder(run).mkdir(parents=True, exist_ok=True)
@@ -68,44 +72,47 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     if not names:
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
     shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-    each, wearers, done = {}, {}, count(1)
+    by_motion, by_character, steps = {}, {}, count(1)
     with progress_bar("evaluating", 2 * len(names) + 1) as report:
         for name in names:
             clip = assembly.evaluation_motion(experiment, name)
             tracks, converged = simulate(experiment, stages, character, clip)
-            report(next(done))
-            each[Path(name).stem] = measure(experiment, character, clip, tracks, converged, shapes)
+            report(next(steps))
+            by_motion[Path(name).stem] = measure(experiment, character, clip, tracks, converged, shapes)
             tracks.save(run, name)
-            report(next(done))
+            report(next(steps))
         first = assembly.motion(experiment, names[0])
         long = _long(experiment, stages, character, first)
         if config.evaluation.wearers:
-            wearers = _characters(experiment, stages, first)
-        report(next(done))
+            by_character = _characters(experiment, stages, first)
+        report(next(steps))
     return {
-        "evaluation": {stage: _mean([one[stage] for one in each.values()]) | long.get(stage, {}) for stage in stages},
-        "motions": each,
-        "wearers": wearers,
+        "evaluation": {
+            stage: _mean([one[stage] for one in by_motion.values()]) | long.get(stage, {}) for stage in stages
+        },
+        "motions": by_motion,
+        "wearers": by_character,
         "betas": betas.tolist(),
         "gap_frames": config.evaluation.gap_frames,
         "garment": config.garment,
     }
 
 
-# a garment's trajectory [T - 2, V, 3] m, relative to the root, by what moves it: compiled for a character and a clip
+# compiles, for a character and a clip, a function that returns the garment's trajectory [T - 2, V, 3] m, relative to
+# the root
 Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
 
 
 def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
-    """The stages that are measured, by name.
+    """Return the stages to measure, by name.
 
     Args:
         model: of `load_run`.
     """
     config = experiment.config
     baseline = config.peer.network
-    kept = input_joints(experiment.names, config.stage2)
-    make = animators.baseline_animator(kept) if baseline else animators.phi_animator
+    joints = input_joints(experiment.names, config.stage2)
+    make = animators.baseline_animator(joints) if baseline else animators.phi_animator
     play = jax.jit(lambda m, c, p: rollouts.states(make, m, experiment, c, p))
 
     def skinned(character: Character, clip: Motion):
@@ -127,16 +134,16 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
 def simulate(
     experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion
 ) -> tuple[Tracks, float]:
-    """The trajectories of the stages and of the reference solver, and the share of the solver's frames that converged.
+    """Simulate the stages and the reference solver; also return the share of the solver's frames that converged.
 
-    The solver has the first `evaluation.solver_frames` frames.
+    The solver simulates the first `evaluation.solver_frames` frames.
     """
     poses = windows(clip)
     frames = poses.translation.shape[0]
     tracks = {name: stage(character, clip)() for name, stage in stages.items()}
     start = jax.tree.map(lambda x: x[: experiment.config.evaluation.solver_frames], poses)
     solved, infos = reference.simulate(experiment.scene, character, start, experiment.config)
-    solved = solved[:frames]  # of a clip shorter than that, the solver's goes one frame further
+    solved = solved[:frames]  # of a shorter clip, the solver simulates one frame more
     return Tracks(tracks, solved), float(np.mean([info.converged for info in infos]))
 
 
@@ -148,7 +155,7 @@ def measure(
     converged: float,
     blendshapes: np.ndarray | None,
 ) -> dict[str, dict]:
-    """The measures of the stages on one clip, by their names, and of the reference solver.
+    """Measure the stages on one clip, by their names, and the reference solver.
 
     Args:
         tracks, converged: of `simulate`.
@@ -169,7 +176,7 @@ def measure(
         measured = metrics.gaps(steps)
         if scene.touchable:
             body, every_fourth = experiment.body, range(SETTLING_FRAMES, frames, 4)
-            measured |= metrics.penetrations(scene, body, character.betas, track, poses, every_fourth, experiment.names)
+            measured |= metrics.penetrations(body, character.betas, track, poses, every_fourth, experiment.names)
         measured |= metrics.edge_strain(scene, character, track[late])
         measured["edge_strain_ratio"] = measured["edge_strain_p95"] / strain["edge_strain_p95"]
         measured |= metrics.beside_solver(scene, track[common], solved[common], tracks.stages["lbs"][common])
@@ -179,7 +186,7 @@ def measure(
 
 
 def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) -> dict[str, dict]:
-    """Gaps of the stages but skinning on nine characters, over the start of a clip."""
+    """Measure the gaps of all stages but skinning on nine characters, over the start of a clip."""
     config = experiment.config
     clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
     poses = windows(clip)
@@ -198,9 +205,9 @@ def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) 
 
 
 def _long(experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion) -> dict[str, dict]:
-    """Measures of the stages but skinning over the long rollout, with their times, and of Psi against Phi."""
+    """Measure all stages but skinning over the long rollout, with their times, and Psi against Phi."""
     clip = assembly.there_and_back(clip, experiment.config.evaluation.long_frames + 2)
-    tracks, found = {}, {}
+    tracks, result = {}, {}
     for name in stages:
         if name == "lbs":
             continue
@@ -208,21 +215,21 @@ def _long(experiment: Experiment, stages: dict[str, Stage], character: Character
         started = time.perf_counter()
         track = tracks[name] = run()
         seconds = time.perf_counter() - started
-        found[name] = {"finite": bool(np.isfinite(track).all()), "ms_per_frame": 1e3 * seconds / len(track)}
+        result[name] = {"finite": bool(np.isfinite(track).all()), "ms_per_frame": 1e3 * seconds / len(track)}
     if "psi" in tracks:
         apart = metrics.distance_mm(tracks["phi"], tracks["psi"])
-        found["psi"] |= {
+        result["psi"] |= {
             "psi_phi_mm": float(apart[SETTLING_FRAMES:].mean()),
             "psi_phi_mm_max": float(apart[SETTLING_FRAMES:].max()),
             "psi_phi_mm_last100": float(apart[-100:].mean()),
             "psi_phi_mm_slope": 1e3
             * float(np.polyfit(np.arange(len(apart) - SETTLING_FRAMES), apart[SETTLING_FRAMES:], 1)[0]),
         }
-    return found
+    return result
 
 
 def table(stages: dict) -> str:
-    """The measures of the stages for a reader, as Markdown."""
+    """Format the measures of the stages as a Markdown table."""
     rows = [f"| | {' | '.join(stages)} |", "|---" * (len(stages) + 1) + "|"]
     for name in dict.fromkeys(key for measured in stages.values() for key in measured):
         cells = (_cell(measured.get(name)) for measured in stages.values())

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,13 +28,13 @@ class Tracks(NamedTuple):
     solver: np.ndarray  # of the reference solver; of a long motion, its start
 
     def save(self, run: Path, motion: str) -> None:
-        """Keeps them with a run, for pictures."""
-        stages = {name: np.asarray(track, np.float32) for name, track in self.stages.items()}
-        np.savez_compressed(_tracks_path(run, motion), **stages, solver=self.solver)
+        """Save the trajectories in a run's folder, for pictures."""
+        arrays: dict[str, Any] = {name: np.asarray(track, np.float32) for name, track in self.stages.items()}
+        np.savez_compressed(_tracks_path(run, motion), **arrays, solver=self.solver)
 
     @classmethod
     def load(cls, run: Path, motion: str) -> "Tracks":
-        """Those that `save` left.
+        """Load the trajectories that `save` wrote.
 
         Raises:
             ValueError: if there are none.
@@ -48,7 +48,7 @@ class Tracks(NamedTuple):
 
 
 def output_folder(run: Path) -> Path:
-    """The folder for trajectories that are kept: the run's own, or one for a garment of the library."""
+    """Return the folder for trajectories: the run's own, or one for a garment of the library."""
     return Path("runs") / "pretrained" / run.name if trained.packed(run) else run
 
 
@@ -57,13 +57,13 @@ def _tracks_path(run: Path, motion: str) -> Path:
 
 
 def windows(clip: Motion) -> Pose:
-    """Every window of three poses in a clip, [T - 2, 3, ...]."""
-    reel = jax.tree.map(jnp.asarray, assembly.windows(clip))
-    return jax.vmap(lambda t: motion_clips.poses(reel, t))(jnp.arange(1, len(clip.translation) - 1))
+    """Return every window of three poses in a clip, [T - 2, 3, ...]."""
+    clips = jax.tree.map(jnp.asarray, assembly.windows(clip))
+    return jax.vmap(lambda t: motion_clips.poses(clips, t))(jnp.arange(1, len(clip.translation) - 1))
 
 
 def skinned_trajectory(experiment: Experiment, character: Character, poses: Pose) -> np.ndarray:
-    """Plain skinning [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
+    """Skin the garment [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
 
     def one(pose):
         window = characters.window(experiment.scene, character, pose)
@@ -73,19 +73,19 @@ def skinned_trajectory(experiment: Experiment, character: Character, poses: Pose
 
 
 def states(make: MakeAnimator, model: dict, experiment: Experiment, character: Character, poses: Pose) -> Array:
-    """An animator's rollout: [T, V, 3] m at the middle frame of each window, relative to its root."""
+    """Roll an animator out: [T, V, 3] m at the middle frame of each window, relative to its root."""
     animator = make(model, experiment.scene, character, experiment.config)
     return rollout.play(animator, experiment.scene, character, poses, experiment.config).states.position
 
 
 def phi_trajectory(experiment: Experiment, phi: dict, character: Character, poses: Pose) -> np.ndarray:
-    """Phi in an autoregressive rollout: [T - 2, V, 3] m likewise."""
+    """Roll Phi out: [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
     play = jax.jit(lambda m, p: states(phi_animator, m, experiment, character, p))
     return np.asarray(play(phi, poses))
 
 
 def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
-    """Psi in an autoregressive rollout: [T - 2, V, 3] m at the same frames, relative to the root."""
+    """Roll Psi out on a clip: [T - 2, V, 3] m at the same frames, relative to the root."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
     origin = part.translation[:1]
     local = part._replace(translation=(part.translation - origin).astype(np.float32), rotations=part.rotations)
@@ -96,11 +96,11 @@ def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
 def load_run(
     directory: Path, evaluation: EvaluationConfig | None = None, read: Callable = trained.phi
 ) -> tuple[assembly.Experiment, dict]:
-    """Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`.
+    """Load Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`.
 
     Args:
-        evaluation: in the place of what the run was trained with.
-        read: `trained.network` takes a baseline's network too.
+        evaluation: default: what the run was trained with.
+        read: `trained.network` reads a baseline's network too.
     """
     config, model = read(directory)
     return assembly.assemble(dataclasses.replace(config, evaluation=evaluation or config.evaluation)), model

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import Config
-from clothjax.networks import baselines, decoder, normalisation, phi
+from clothjax.networks import baselines, decoder, mlp, normalisation, phi
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import Normalizers
 from clothjax.networks.psi import Psi, constant_inputs, window_inputs
@@ -22,7 +22,7 @@ MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
 
 
 def memory_size(scene: Scene, config: Config) -> int:
-    """Numbers L that an animator carries from frame to frame: the code, or a baseline's memory."""
+    """Count the numbers L that an animator carries from frame to frame: the code, or a baseline's memory."""
     if config.peer.network:
         return baselines.memory_size(config)
     left, channels = phi.latent_size(scene, config.model)
@@ -30,7 +30,7 @@ def memory_size(scene: Scene, config: Config) -> int:
 
 
 def phi_animator(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
-    """Phi, of `params` and `statistics`, as what moves a character's garment."""
+    """Make Phi, of `params` and `statistics`, the animator of a character's garment."""
 
     def step(inputs: StepInput) -> StepOutput:
         return phi.step(model, scene, character, inputs, config.model, config.material)
@@ -38,20 +38,23 @@ def phi_animator(model: dict, scene: Scene, character: Character, config: Config
     return Animator(memory_size(scene, config), step)
 
 
-def baseline_animator(kept: np.ndarray) -> MakeAnimator:
-    """A baseline's network, of `params`, as what moves a character's garment: on the joints `kept`."""
+def baseline_animator(input_joints: np.ndarray) -> MakeAnimator:
+    """Return a function that makes a baseline's network, of `params`, the animator of a character's garment.
+
+    Args:
+        input_joints: indices of the joints that are inputs.
+    """
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
         constants = constant_inputs(character.betas, character.material, config.material)
         free = phi.free(scene)
-
         network = baselines.network(config, len(free))
 
         def step(inputs: StepInput) -> StepOutput:
-            seen = baselines.inputs(inputs.poses, character.joints, constants, scene.body.parents, kept, config)
-            displaced, memory = network.apply({"params": model["params"]}, inputs.state.latent, **seen)
-            moved = character.template, inputs.window.following.garment
-            return StepOutput(decoder.vertices(displaced * free[:, None], *moved), memory)
+            seen = baselines.inputs(inputs.poses, character.joints, constants, scene.body.parents, input_joints, config)
+            displaced, memory = mlp.apply(network, model["params"], inputs.state.latent, **seen)
+            transforms = inputs.window.following.garment
+            return StepOutput(decoder.vertices(displaced * free[:, None], character.template, transforms), memory)
 
         return Animator(memory_size(scene, config), step, recurrent=True)
 
@@ -59,8 +62,11 @@ def baseline_animator(kept: np.ndarray) -> MakeAnimator:
 
 
 class Preconditioners(NamedTuple):
-    """What gradients are multiplied by where they enter Psi and where they leave it: a Kronecker-factored
-    preconditioner (Martens and Grosse 2015) of its first layer's inputs and its last layer's outputs."""
+    """Factors of the gradients of Psi's first and last layer.
+
+    Together they are a Kronecker-factored preconditioner (Martens and Grosse 2015) of the first layer's inputs and the
+    last layer's outputs.
+    """
 
     pose: Array  # [P, P] of normalised pose inputs
     code: Array | None  # [L, L] of normalised codes
@@ -68,7 +74,8 @@ class Preconditioners(NamedTuple):
 
 @jax.custom_vjp
 def precondition(matrix: Array, code: Array) -> Array:
-    """The same code [L], whose gradient is multiplied by a symmetric matrix [L, L]."""
+    """Return the same code [L]; its gradient is multiplied by a symmetric matrix [L, L]."""
+    del matrix  # of the gradient alone
     return code
 
 
@@ -76,18 +83,23 @@ precondition.defvjp(lambda matrix, code: (code, matrix), lambda matrix, g: (jnp.
 
 
 def learning_from(params: Params, inputs: Array) -> Params:
-    """The same predictor, whose first layer gets its gradient as if it had been given other inputs [N]."""
-    first, still = params["dense_0"], jax.lax.stop_gradient
-    outputs = still(inputs) @ first["kernel"]
-    return params | {"dense_0": {"kernel": still(first["kernel"]), "bias": first["bias"] + (outputs - still(outputs))}}
+    """Return the same predictor; its first layer gets its gradient as if it had been given other inputs [N]."""
+    first, stop = params["dense_0"], jax.lax.stop_gradient
+    outputs = stop(inputs) @ first["kernel"]
+    return params | {"dense_0": {"kernel": stop(first["kernel"]), "bias": first["bias"] + (outputs - stop(outputs))}}
 
 
 def psi_animator(
-    garment: dict, normalizers: Normalizers, kept: np.ndarray, gradients: Preconditioners | None = None
+    garment: dict, normalizers: Normalizers, input_joints: np.ndarray, gradients: Preconditioners | None = None
 ) -> MakeAnimator:
-    """Psi, of `params`, as what moves a character's garment: with a frozen decoder, on the joints `kept`.
+    """Return a function that makes Psi, of `params`, the animator of a character's garment, with a frozen decoder.
 
-    Codes are brought into their range as in use; gradients pass as if none had been out of it.
+    Codes are clipped to their range as at run time; gradients pass as if none had been out of it.
+
+    Args:
+        garment: parameters of the decoder.
+        input_joints: indices of the joints that are inputs.
+        gradients: preconditioners, if any.
     """
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
@@ -95,12 +107,12 @@ def psi_animator(
 
         def step(inputs: StepInput) -> StepOutput:
             params = model["params"]
-            pose = window_inputs(inputs.poses, character.joints, scene.body.parents, kept, config.fps)
+            pose = window_inputs(inputs.poses, character.joints, scene.body.parents, input_joints, config.fps)
             pose = normalisation.normalise(normalizers.pose, pose)
             now = normalisation.normalise(normalizers.latent, inputs.state.latent)
             if gradients is not None:
                 params = learning_from(params, jnp.concatenate([now, gradients.pose @ pose, constants]))
-            latent = Psi(config.stage2).apply({"params": params}, now, pose, constants)
+            latent = mlp.apply(Psi(config.stage2), params, now, pose, constants)
             inside, _ = normalisation.bounded(latent, normalizers.latent.low, normalizers.latent.high)
             latent += jax.lax.stop_gradient(inside - latent)
             shown = latent

@@ -1,9 +1,9 @@
-"""Networks of peers, trained in the place of Phi and Psi by the same losses: what the method is compared with.
+"""Networks that the method is compared with, trained by the same losses in the place of Phi and Psi.
 
 NCS (Bertiche et al. 2022) and the recurrent network of SNUG (Santesteban et al. 2022) go from the pose to the garment
-without its state; what they know of the past is in gated recurrent units. Both are given what Psi is given too: the
-pose without its heading, of the joints that are Psi's inputs, and the wearer's betas and material. SNUG's pose is in
-6-D codes, not in axis-angle vectors. NCS's motion augmentation is left out, as in its published settings.
+without its state; gated recurrent units remember the past. Both have Psi's inputs: the pose of Psi's joints without
+its heading, and the character's betas and material. SNUG's pose is in 6-D codes, not in axis-angle vectors. NCS's
+motion augmentation is left out, as in its published settings.
 """
 
 import flax.linen as nn
@@ -13,24 +13,24 @@ import numpy as np
 
 from clothjax.body import rotation, skinning
 from clothjax.config import Config
-from clothjax.networks import decoder, psi
+from clothjax.networks import decoder, mlp, psi
 from clothjax.networks.mlp import Params
 from clothjax.types import Array, Pose
 
 STATIC = (64, 128, 256)  # NCS's static encoder, before its last layer
-LOCAL = 32  # what NCS's dynamic encoder makes of each joint
+LOCAL = 32  # channels of each joint in NCS's dynamic encoder
 GRUS = 4  # SNUG's recurrent layers
 
 
 def memory_size(config: Config) -> int:
-    """Numbers that a network carries from frame to frame."""
+    """Count the numbers that a network carries from frame to frame."""
     if config.peer.network == "direct":
         return config.model.latent
     return config.peer.width * (GRUS if config.peer.network == "snug" else 1)
 
 
 def network(config: Config, vertices: int) -> nn.Module:
-    """The configured network of a garment of V vertices.
+    """Build the configured network of a garment of V vertices.
 
     It takes the memory [M] of the frame before and what `inputs` gives. It returns the canonical displacement
     [V, 3] m and the memory that it leaves.
@@ -40,62 +40,73 @@ def network(config: Config, vertices: int) -> nn.Module:
 
 
 def init(key: Array, joints: int, constants: int, shapes: Array, config: Config) -> Params:
-    """Parameters for so many joints that are inputs, and constants of a wearer.
+    """Return initial parameters.
 
     Args:
-        shapes: [K, V, 3] m, blend shapes for Psi to start from; of the others, they only give the vertices.
+        joints: number of joints that are inputs.
+        constants: number of constants of a character.
+        shapes: [K, V, 3] m, blend shapes for Psi to start from; the others only count the vertices in them.
     """
-    seen = {
+    example = {
         "ncs": {"static": jnp.zeros(9 * joints + constants), "dynamic": jnp.zeros((joints, 12))},
         "snug": {"inputs": jnp.zeros(6 * joints + 3 + constants)},
         "direct": {"pose": jnp.zeros(6 + 3 * 6 * joints + 3 * 3 * (joints - 1)), "constants": jnp.zeros(constants)},
     }[config.peer.network]
     memory = jnp.zeros(memory_size(config))
-    params = network(config, shapes.shape[1]).init(key, memory, **seen)["params"]
+    params = mlp.init(network(config, shapes.shape[1]), key, memory, **example)
     if config.peer.network == "direct":
         params["garment"]["blendshapes"] = 0.1 * shapes
     return params
 
 
 def inputs(
-    poses: Pose, joints: Array, constants: Array, parents: np.ndarray, kept: np.ndarray, config: Config
+    poses: Pose, joints: Array, constants: Array, parents: Array, input_joints: np.ndarray, config: Config
 ) -> dict[str, Array]:
-    """What a network sees of three poses: NCS `static` [S] and `dynamic` [Jk, 12]; SNUG `inputs` [N]; Psi `pose` [P]
-    and `constants` [C].
+    """Compute a network's inputs from three poses.
+
+    These are NCS's `static` [S] and `dynamic` [Jk, 12], SNUG's `inputs` [N], or Psi's `pose` [P] and `constants` [C].
 
     Args:
-        joints: [J, 3] m, of the shaped body; constants: [C] of the wearer; kept: joint indices, the root first.
+        joints: [J, 3] m, of the shaped body.
+        constants: [C] of the character.
+        input_joints: indices of the joints that are inputs, the root first.
     """
     if config.peer.network == "direct":
-        return {"pose": psi.window_inputs(poses, joints, parents, kept, config.fps), "constants": constants}
-    poses = _facing(poses, int(kept[0]))
+        return {"pose": psi.window_inputs(poses, joints, parents, input_joints, config.fps), "constants": constants}
+    poses = _facing(poses, int(input_joints[0]))
     if config.peer.network == "snug":
-        codes = rotation.to_6d(poses.rotations[2, kept]).reshape(-1)
+        codes = rotation.to_6d(poses.rotations[2, input_joints]).reshape(-1)
         return {"inputs": jnp.concatenate([codes, config.fps * poses.translation[2], constants])}
-    static, dynamic = joint_inputs(poses, joints, parents, kept, config.fps)
+    static, dynamic = joint_inputs(poses, joints, parents, input_joints, config.fps)
     return {"static": jnp.concatenate([static.reshape(-1), constants]), "dynamic": dynamic}
 
 
 def _facing(poses: Pose, root: int) -> Pose:
-    """A window of three poses, turned about the vertical so that the last one faces ahead."""
+    """Turn a window of three poses about the vertical so that the last one faces ahead."""
     turn = rotation.heading(poses.rotations[2, root]).T
     turned = jnp.matmul(turn[None], poses.rotations[:, root], precision="highest")
     advance = jnp.einsum("ab,nb->na", turn, poses.translation, precision="highest")
-    return Pose(poses.rotations.at[:, root].set(turned), advance)
+    return Pose(jnp.asarray(poses.rotations).at[:, root].set(turned), advance)
 
 
 # --- NCS ----------------------------------------------------------------------------------------------------------
 
 
-def joint_inputs(poses: Pose, joints: Array, parents: np.ndarray, kept: np.ndarray, fps: float) -> tuple[Array, Array]:
-    """NCS's inputs of every joint: static [Jk, 9], its 6-D rotation and where down is; dynamic [Jk, 12], their rate of
-    change, and its acceleration in m/s^2, both in its own frame."""
+def joint_inputs(
+    poses: Pose, joints: Array, parents: Array, input_joints: np.ndarray, fps: float
+) -> tuple[Array, Array]:
+    """Compute NCS's inputs of every joint, in the joint's own frame.
+
+    Returns:
+        Static inputs [Jk, 9]: its 6-D rotation and the direction down. Dynamic inputs [Jk, 12]: their rate of change,
+        and its acceleration in m/s^2.
+    """
 
     def one(rotations, translation):
         turns, positions = skinning.forward_kinematics(rotations, joints, parents)
         down = -turns[:, 1, :]  # R^T (0, -1, 0)
         codes = jnp.concatenate([rotation.to_6d(rotations), down], axis=-1)
-        return codes[kept], positions[kept] + translation[None], turns[kept]
+        return codes[input_joints], positions[input_joints] + translation[None], turns[input_joints]
 
     codes, positions, turns = jax.vmap(one)(poses.rotations, poses.translation)
     acceleration = fps**2 * (positions[2] - 2.0 * positions[1] + positions[0])
@@ -125,14 +136,14 @@ class NCS(nn.Module):
 
     @nn.compact
     def __call__(self, memory: Array, static: Array, dynamic: Array) -> tuple[Array, Array]:
-        """Displacements [V, 3] m and the dynamic code [W], which is the memory: zero as long as nothing moves."""
-        peer, width = self.config.peer, self.config.peer.width
+        """Return displacements [V, 3] m and the dynamic code [W], the memory: zero as long as nothing moves."""
+        settings, width = self.config.peer, self.config.peer.width
         static = Layers((*STATIC, width), name="static")(static)
         local = Layers((LOCAL, LOCAL), bias=False, name="local")(dynamic)
         moving = Layers((width, width), bias=False, name="dynamic")(local.reshape(-1))
         memory = GRU(width, bias=False, name="unit")(memory, moving)
-        weights = Layers((width, width, peer.blendshapes), name="decoder")(static + memory)
-        size = (peer.blendshapes, 3 * self.vertices)
+        weights = Layers((width, width, settings.blendshapes), name="decoder")(static + memory)
+        size = (settings.blendshapes, 3 * self.vertices)
         return (weights @ self.param("blendshapes", nn.initializers.glorot_normal(), size)).reshape(-1, 3), memory
 
 
@@ -146,7 +157,7 @@ class Units(nn.Module):
 
     @nn.compact
     def __call__(self, memory: Array, x: Array) -> Array:
-        """The new states [4 W] from those before and the inputs [N]."""
+        """Return the new states [4 W] from those before and the inputs [N]."""
         states = []
         for index, state in enumerate(jnp.split(memory, GRUS)):
             x = GRU(self.width, name=str(index))(state, x)
@@ -162,7 +173,7 @@ class SNUG(nn.Module):
 
     @nn.compact
     def __call__(self, memory: Array, inputs: Array) -> tuple[Array, Array]:
-        """Displacements [V, 3] m and the states [4 W] of its units."""
+        """Return displacements [V, 3] m and the states [4 W] of its units."""
         width = self.config.peer.width
         memory = Units(width, name="units")(memory, inputs)
         output = nn.Dense(3 * self.vertices, kernel_init=nn.initializers.glorot_normal(), name="output")
@@ -173,7 +184,7 @@ class SNUG(nn.Module):
 
 
 class Direct(nn.Module):
-    """Psi with codes and inputs as they are: without a teacher there is nothing to normalise codes by."""
+    """Psi without normalisers: there is no teacher to measure the codes of."""
 
     config: Config
     vertices: int
@@ -183,7 +194,7 @@ class Direct(nn.Module):
         self.garment = decoder.Decoder(self.config.model, self.config.model.latent, self.vertices)
 
     def __call__(self, memory: Array, pose: Array, constants: Array) -> tuple[Array, Array]:
-        """Displacements [V, 3] m and the code [L], which is the memory."""
+        """Return displacements [V, 3] m and the code [L], which is the memory."""
         code = self.predictor(memory, pose, constants)
         return self.garment(code, jnp.ones(self.vertices)), code
 
@@ -199,9 +210,9 @@ class GRU(nn.Module):
 
     @nn.compact
     def __call__(self, state: Array, x: Array) -> Array:
-        """The new state [W] from the one before and the inputs [N]."""
+        """Return the new state [W] from the one before and the inputs [N]."""
 
-        def product(name: str, rows: Array, kernel) -> list[Array]:
+        def product(name: str, rows: Array, kernel) -> list[jax.Array]:
             return jnp.split(nn.Dense(3 * self.width, self.bias, kernel_init=kernel, name=name)(rows), 3)
 
         update, reset, new = product("input", x, nn.initializers.glorot_uniform())

@@ -1,4 +1,4 @@
-"""From a latent code to vertices (METHOD.md, Decoder): decoder, blend shapes, skinning. Shared by Phi and Psi."""
+"""Decoder, blend shapes and skinning, from a latent code to vertices (METHOD.md, Decoder). Phi and Psi share it."""
 
 import flax.linen as nn
 import jax
@@ -6,12 +6,13 @@ import jax.numpy as jnp
 
 from clothjax.body import skinning
 from clothjax.config import ModelConfig
+from clothjax.networks import mlp
 from clothjax.networks.mlp import MLP, Params
 from clothjax.types import Array
 
 
 class Decoder(nn.Module):
-    """From a latent code [L] to a canonical displacement [V, 3] m.
+    """Network from a latent code [L] to a canonical displacement [V, 3] m.
 
     The last layer is near zero at first: a decoder of ordinary size would start the garment metres away, with 4e4 J
     instead of a skinned garment's few. The blend shapes are zero at first: training gives them a basis.
@@ -27,10 +28,10 @@ class Decoder(nn.Module):
         self.blendshapes = self.param("blendshapes", nn.initializers.zeros, (config.blendshapes, self.vertices, 3))
         if config.decoder_skip:
             # each weight starts as one entry of the code
-            self.skip = self.param("skip", lambda key, *shape: jnp.eye(*shape), self.latent, config.blendshapes)
+            self.skip = self.param("skip", lambda _, *shape: jnp.eye(*shape), self.latent, config.blendshapes)
 
     def __call__(self, latent: Array, free: Array) -> Array:
-        """Canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is zero (pins)."""
+        """Compute the canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is."""
         shapes = self.blendshapes
         flat = jnp.matmul(
             self.blend_weights(latent), shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST
@@ -38,7 +39,7 @@ class Decoder(nn.Module):
         return flat.reshape(shapes.shape[1:]) * free[:, None]
 
     def blend_weights(self, latent: Array) -> Array:
-        """Blend-shape weights [K] of a latent code [L]."""
+        """Compute the blend-shape weights [K] of a latent code [L]."""
         weights = self.decoder(latent)
         if self.config.decoder_skip:
             weights = weights + latent @ self.skip
@@ -46,17 +47,17 @@ class Decoder(nn.Module):
 
 
 def init(key: Array, latent: int, basis: Array, config: ModelConfig) -> Params:
-    """Parameters for codes of size L whose blend shapes start from a basis [K, V, 3] m."""
+    """Return initial parameters for codes of size L, with a basis [K, V, 3] m as blend shapes."""
     count = basis.shape[1]
-    params = Decoder(config, latent, count).init(key, jnp.zeros(latent), jnp.ones(count))["params"]
+    params = mlp.init(Decoder(config, latent, count), key, jnp.zeros(latent), jnp.ones(count))
     return params | {"blendshapes": jnp.asarray(basis)}
 
 
 def of(params: Params, config: ModelConfig) -> Decoder:
-    """The decoder that has such parameters."""
+    """Return the decoder that has such parameters."""
     return Decoder(config, params["decoder"]["dense_0"]["kernel"].shape[0], params["blendshapes"].shape[1])
 
 
 def vertices(displaced: Array, template: Array, transforms: Array) -> Array:
-    """Garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4]."""
+    """Return garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4]."""
     return skinning.apply(transforms, template + displaced)

@@ -5,6 +5,7 @@ Nothing here changes when the scene is moved, or turned about the vertical.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from clothjax.body import skinning
@@ -20,7 +21,7 @@ BODY_RADIUS = 0.03  # m, garment and body vertices closer than this are joined
 
 
 class WorldFeatures(NamedTuple):
-    """Of the body: nodes, and pairs of a garment vertex with the body vertex nearest to it."""
+    """Features of body nodes, and of pairs of a garment vertex with the body vertex nearest to it."""
 
     nodes: Array  # [S, N], a slot for every body vertex that may be nearest to some garment vertex
     slots: Array  # [V] int32, the slot of each garment vertex
@@ -33,11 +34,11 @@ class Features(NamedTuple):
     """Raw inputs of the encoders."""
 
     nodes: Array  # [V, N]
-    edges: dict[str, Array]  # [E, M] by edge set
+    edges: dict[str, jax.Array]  # [E, M] by edge set
     world: WorldFeatures | None  # None where there is no body
 
     def columns(self) -> dict[str, list[Array]]:
-        """The features that share columns, and so statistics."""
+        """Return the features by kind: those of a kind share columns, and so statistics."""
         nodes, pairs = [self.nodes], {}
         if self.world is not None:
             nodes.append(self.world.nodes)
@@ -57,13 +58,13 @@ def compute(
     model: ModelConfig,
     material: MaterialConfig,
 ) -> Features:
-    """The inputs of Phi for one step: HOOD's, plus positions and accelerations (METHOD.md, Phi).
+    """Compute the inputs of Phi for one step: HOOD's, plus positions and accelerations (METHOD.md, Phi).
 
     Args:
         contact: planes at the body points nearest to the garment now; None where there is no body.
         timestep: s.
-        held: [V, 3] m, the next positions if the canonical displacement were kept.
-        force: [V, 3] N on the garment there, minus the potential's gradient.
+        held: [V, 3] m, the next positions if the canonical displacement stayed the same.
+        force: [V, 3] N on the garment at `held`, minus the potential's gradient.
     """
     turn = window.current.heading.T
     inputs = material_inputs(character.material, material)
@@ -101,7 +102,12 @@ def compute(
 def _world(
     state: ClothState, window: Window, contact: Contact, timestep: Array, node, inputs: Array, extra: int
 ) -> WorldFeatures:
-    """Of the body, as the garment's: `node` makes rows, which get `extra` columns of zeros."""
+    """Compute body node features and garment-body pair features.
+
+    Args:
+        node: builds rows of nodes.
+        extra: columns of zeros that body rows are padded by.
+    """
     bodies = [frame.body for frame in window]
     before, now, following = bodies
     normals, nearest, slots = window.current.normals, contact.index, contact.index
@@ -126,7 +132,7 @@ def _world(
 
 
 def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
-    """Features [V, 9] of the pairs of garment and body vertices, towards the body and towards the garment.
+    """Compute features [V, 9] of the pairs of garment and body vertices, towards the body and towards the garment.
 
     Args:
         offset_now, offset_next: [V, 3] m from the body vertex, at this frame and at the next, to the garment vertex.
@@ -145,12 +151,11 @@ def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Ar
 def _canonical(
     character: Character, state: ClothState, window: Window, contact: Contact | None, held: Array, force: Array
 ):
-    """The state as the next frame's canonical pose sees it, [V, 22], or [V, 15] without a body; and where it would be
-    if nothing pushed.
+    """Express the state in the next frame's canonical pose, [V, 22], or [V, 15] without a body; also return `drifted`.
 
-    `held` keeps the canonical displacement, `drifted` keeps the velocity: the two guesses between which, roughly,
-    the next position lies. Contact is measured from both; the force at `held` says where to go from there, over the
-    weight of the vertex and compressed, since it spans five decades.
+    `held` keeps the canonical displacement, `drifted` [V, 3] m keeps the velocity. The next position lies, roughly,
+    between these two guesses, and contact is measured from both. The force at `held` is divided by the weight of the
+    vertex and compressed, since it spans five decades.
     """
     following = window.following.garment
     displacement = skinning.unapply(window.current.garment, state.position) - character.template
@@ -175,12 +180,14 @@ def _canonical(
     return jnp.concatenate(columns, axis=-1), drifted
 
 
-def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
-    """Features of edges: relative positions now and at rest, [E, 12]; and the strain of each guess of the next state.
+def mesh_edges(senders, receivers, points, template, turn, timestep, inputs) -> jax.Array:
+    """Compute features of edges: relative positions now and at rest, [E, 12], and the strain of each guess.
 
     Args:
         points: [V, 3] m by name: `now`, and the guesses `held` and `drifted` where there are any.
-        template: [V, 3] m, at rest; turn: [3, 3] into the frame of the features; inputs: [3] the material, or [0].
+        template: [V, 3] m, at rest.
+        turn: [3, 3] into the frame of the features.
+        inputs: [3] the material, or [0].
     """
     rest = template[senders] - template[receivers]
     rest_length = norm(rest, keepdims=True)
@@ -189,7 +196,7 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs):
     for name in ("held", "drifted"):
         if name in points:
             vector = points[name][senders] - points[name][receivers]
-            columns += [norm(vector, keepdims=True) / rest_length - 1.0]
+            columns.append(norm(vector, keepdims=True) / rest_length - 1.0)
     columns += [
         _column(jnp.asarray(timestep), len(senders)),
         jnp.broadcast_to(inputs[None], (len(senders), *inputs.shape)),

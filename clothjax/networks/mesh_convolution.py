@@ -11,10 +11,17 @@ from clothjax.types import Array
 
 
 class Table(Protocol):
-    """The neighbours of a block: which of N inputs each of P outputs reads, as in `mesh_hierarchy.Level`."""
+    """The neighbours of a block: the inputs, of N, that each of P outputs reads, as in `mesh_hierarchy.Level`."""
 
-    ids: Array  # [P, K] int32; padding is any number
-    mask: Array  # [P, K] bool, false at padding, which then has no effect and no gradient
+    @property
+    def ids(self) -> Array:
+        """[P, K] int32; padding is any number."""
+        ...
+
+    @property
+    def mask(self) -> Array:
+        """[P, K] bool, false at padding, which has no effect and no gradient."""
+        ...
 
 
 class MeshConvolution(nn.Module):
@@ -23,12 +30,12 @@ class MeshConvolution(nn.Module):
     The convolution is b + sum_k x[ids[p, k]] (sum_m a[p, k, m] W[m]). The residual pools the neighbours with
     weights |density| that sum to one, if P != N, and maps channels, if I != O.
 
-    Initial values keep the mean square of the features through a block with ReLU, if neighbours resemble each
-    other. The paper's, N(0, 1) for `basis`, N(0, 1) / (mean count M) for `coefficients` and N(0, 1) / O for
-    `skip`, do not: from 128 to 256 features the skip leaves less than a twentieth, and stacked blocks fade.
+    Initial values preserve the mean square of the features through a block with ReLU, if neighbours resemble each
+    other. The paper has N(0, 1) for `basis`, N(0, 1) / (mean count M) for `coefficients` and N(0, 1) / O for `skip`.
+    With these, a skip from 128 to 256 features leaves less than a twentieth, and stacked blocks fade.
 
-    Parameters are `basis` [I, M, O], `coefficients` [P, K, M] and `bias` [O] if r < 1; `density` [P, K] if r > 0 and
-    P != N; `skip` [I, O] if r > 0 and I != O.
+    Parameters if r < 1: `basis` [I, M, O], `coefficients` [P, K, M] and `bias` [O]. Parameters if r > 0: `density`
+    [P, K] if P != N, and `skip` [I, O] if I != O.
     """
 
     features: int  # channels O
@@ -39,10 +46,10 @@ class MeshConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, table: Table) -> Array:
-        """[P, O] features of x [N, I].
+        """Return features [P, O] of x [N, I].
 
         Raises:
-            ValueError: a rate outside [0, 1].
+            ValueError: if `residual_rate` is outside [0, 1].
         """
         rate, inputs, outputs = self.residual_rate, x.shape[-1], self.features
         if not 0 <= rate <= 1:
@@ -50,7 +57,7 @@ class MeshConvolution(nn.Module):
         ids = jnp.where(table.mask, table.ids, 0)
         weights = jnp.asarray(table.mask, x.dtype)
         normal = nn.initializers.normal
-        out = 0.0
+        out = jnp.zeros(())
         if rate < 1:
 
             def coefficient(key, shape):
@@ -85,16 +92,17 @@ class Convolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, tables: Sequence[Table]) -> Array:
-        """Features [P, O] of the last block of x [N, I]; each block has its own table."""
+        """Return features [P, O] of the last block of x [N, I]; each block has its own table."""
         for index, (features, table) in enumerate(zip(self.features, tables, strict=True)):
             x = MeshConvolution(features, self.bases, name=str(index))(x, table)
         return x
 
 
 def _convolve(basis: Array, coefficients: Array, x: Array, ids: Array) -> Array:
-    """[P, O] of basis [I, M, O], masked coefficients [P, K, M], inputs [N, I] and neighbours [P, K]."""
+    """Convolve inputs [N, I] to [P, O] by a basis [I, M, O], masked coefficients [P, K, M] and neighbours [P, K]."""
     features, bases, outputs = basis.shape
-    if _basis_first(x.shape[0], *ids.shape, features, outputs, bases):
+    places, slots = ids.shape
+    if _basis_first(len(x), places, slots, features, outputs, bases):
         transformed = (x @ basis.reshape(features, -1)).reshape(-1, bases, outputs)
         return jnp.einsum("pkmo,pkm->po", _gather(transformed, ids), coefficients)
     # This order of operands, with M innermost, is the fastest of those tried under vmap on a CPU.
@@ -103,7 +111,7 @@ def _convolve(basis: Array, coefficients: Array, x: Array, ids: Array) -> Array:
 
 
 def _basis_first(inputs: int, outputs: int, slots: int, features: int, channels: int, bases: int) -> bool:
-    """Whether to transform all inputs before gathering them: narrow last blocks, where it is far cheaper."""
+    """Return whether it is far cheaper to transform all inputs before gathering them, as in narrow last blocks."""
     gather_first = outputs * slots * bases * features + outputs * bases * features * channels
     basis_first = inputs * bases * features * channels + outputs * slots * bases * channels
     return 2 * basis_first <= gather_first and bases * channels <= features

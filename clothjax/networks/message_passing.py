@@ -28,7 +28,7 @@ class World(NamedTuple):
     nodes: Array  # [S, W] latents of the body nodes
     slots: Array  # [V] int32, the body node of each garment vertex
     active: Array  # [V] bool, the pairs that pass messages
-    pairs: dict[str, Array]  # latents [V, W]: `to_garment`, and `to_body` if body nodes are to be updated
+    pairs: dict[str, jax.Array]  # latents [V, W]: `to_garment`, and `to_body` if body nodes are to be updated
 
 
 class Latents(NamedTuple):
@@ -44,8 +44,7 @@ class Latents(NamedTuple):
 
 
 class Block(nn.Module):
-    """One residual message-passing block. First layers are applied before their inputs are gathered or put side by
-    side."""
+    """One residual message-passing block. First layers are applied before their inputs are gathered or concatenated."""
 
     width: int
     layers: int
@@ -61,7 +60,7 @@ class Block(nn.Module):
         self.node = MLP(((1 + len(names)) * self.width, *hidden))
 
     def __call__(self, latents: Latents, slots: Array | None, active: Array | None) -> tuple[Latents, None]:
-        """The latents after the block.
+        """Return the latents after the block.
 
         Args:
             slots, active: [R] as in `World`, of the vertices in reach.
@@ -71,17 +70,17 @@ class Block(nn.Module):
         arrived, new_edges, new_pairs = {}, {}, {}
         for name, graph in self.graphs.items():
             message = self._message(name, here, here, edges[name], graph.receivers, graph.senders)
-            arrived[name] = jraph.segment_sum(message, graph.receivers, len(here), indices_are_sorted=True)
+            arrived[name] = _sum_at(graph.receivers, message, len(here), indices_are_sorted=True)
             new_edges[name] = edges[name] + message
-        if "to_garment" in pairs:
+        if body is not None and slots is not None and active is not None:
             message = self._message("world", here, body, pairs["to_garment"], None, slots)
             arrived["world"] = jnp.where(active[:, None], message, 0.0)
             new_pairs["to_garment"] = pairs["to_garment"] + arrived["world"]
-        if "to_body" in pairs:
-            message = self._message("world", body, here, pairs["to_body"], slots, None)
-            back = jnp.where(active[:, None], message, 0.0)
-            new_pairs["to_body"] = pairs["to_body"] + back
-            new_body = body + self._updated(body, jraph.segment_sum(back, slots, len(body)), None)
+            if "to_body" in pairs:
+                message = self._message("world", body, here, pairs["to_body"], slots, None)
+                back = jnp.where(active[:, None], message, 0.0)
+                new_pairs["to_body"] = pairs["to_body"] + back
+                new_body = body + self._updated(body, _sum_at(slots, back, len(body)), None)
         everything = checkpoint_name(jnp.concatenate([arrived[name] for name in sorted(arrived)], axis=-1), ARRIVED)
         return Latents(nodes + self._updated(nodes, everything, self.rows), new_body, new_edges, new_pairs), None
 
@@ -91,7 +90,7 @@ class Block(nn.Module):
 
     @nn.nowrap
     def _updated(self, nodes: Array, arrived: Array, rows: np.ndarray | None) -> Array:
-        """MLP([node, 0, arrived]) with the messages that arrived at some rows, as the last of its inputs."""
+        """Compute MLP([node, 0, arrived]), with the messages that arrived at some rows as the last inputs."""
         first = self.node.dense[0]
         own = first.product(nodes) + first.bias[None]
         added = first.product(arrived, begin=first.inputs - arrived.shape[-1])
@@ -99,7 +98,7 @@ class Block(nn.Module):
 
     @nn.nowrap
     def _message(self, name: str, targets, sources, latent, target_index, source_index) -> Array:
-        """MLP([target, source, edge]) with the node parts of its first layer multiplied before the gather."""
+        """Compute MLP([target, source, edge]); the node parts of its first layer are multiplied before the gather."""
         mlp, width = self.edge[name], self.width
         first = mlp.dense[0]
         target, source = first.product(targets), first.product(sources, begin=width)
@@ -108,10 +107,15 @@ class Block(nn.Module):
         return mlp.tail(target + source + first.product(latent, begin=2 * width) + first.bias[None], self.in_chunks)
 
 
+def _sum_at(index: Any, rows: Any, count: int, indices_are_sorted: bool = False) -> jax.Array:
+    """Sum rows [E, W] that have the same index [E], to [count, W]."""
+    return jraph.segment_sum(rows, index, count, indices_are_sorted)
+
+
 class Processor(nn.Module):
     """Stacks of message-passing blocks. A stack is a scan over parameters with a leading axis.
 
-    In a stack without the fine mesh only the vertices of its coarse levels send and receive, from the body too; the
+    In a stack without the fine mesh, only the vertices of its coarse levels exchange messages, with the body too. The
     others go through the node MLP alone.
     """
 
@@ -124,7 +128,7 @@ class Processor(nn.Module):
 
     @nn.compact
     def __call__(self, nodes: Array, graphs: Graphs, world: World | None) -> Array:
-        """Garment node latents [V, W] after all blocks.
+        """Return garment node latents [V, W] after all blocks.
 
         Args:
             nodes: [V, W] of the garment.
@@ -135,7 +139,7 @@ class Processor(nn.Module):
         if self.remat:
             policy = jax.checkpoint_policies.save_only_these_names(ARRIVED)
             block = nn.remat(block, prevent_cse=False, policy=policy)
-        edges = {name: graph.edges for name, graph in graphs.items()}
+        edges: dict[str, Any] = {name: graph.edges for name, graph in graphs.items()}
         body, pairs = (None, {}) if world is None else (world.nodes, world.pairs)
         for index, stack in enumerate(self.stacks):
             rows, among = reached(stack, graphs, self.level)
@@ -144,7 +148,7 @@ class Processor(nn.Module):
                 block,
                 variable_axes={"params": 0},
                 split_rngs={"params": True},
-                in_axes=nn.broadcast,
+                in_axes=nn.broadcast,  # pyright: ignore[reportArgumentType]  # flax's annotation has integers alone
                 length=stack.blocks,
             )
             blocks = scanned(
@@ -162,7 +166,7 @@ class Processor(nn.Module):
 
 
 def reached(stack: Stack, graphs: Graphs, level: np.ndarray) -> tuple[np.ndarray | None, Graphs]:
-    """The vertices [R] that have edges in a stack, or None for all, and its edge sets, numbered among these."""
+    """Find the vertices [R] that have edges in a stack (None for all) and its edge sets, numbered among these."""
     among = {name: graphs[name]._replace(edges=None) for name in stack.edges}
     if stack.lowest_level == 0:
         return None, among
@@ -176,26 +180,26 @@ def reached(stack: Stack, graphs: Graphs, level: np.ndarray) -> tuple[np.ndarray
 
 
 class Encoder(nn.Module):
-    """An MLP for every kind of rows, by its name."""
+    """One MLP for every kind of rows, by its name."""
 
     width: int
     layers: int
 
     @nn.compact
     def __call__(self, rows: dict[str, Any]) -> dict[str, Any]:
-        """Latents [N, W] in the place of rows [N, columns]: any number of arrays of each kind."""
+        """Return latents [N, W] in the place of rows [N, columns]; a kind can have several arrays."""
         hidden = (self.width,) * self.layers
-        found = {}
+        latents = {}
         for name, parts in rows.items():
             mlp = MLP((jax.tree.leaves(parts)[0].shape[-1], *hidden), name=name)
-            found[name] = jax.tree.map(mlp, parts)
-        return found
+            latents[name] = jax.tree.map(mlp, parts)
+        return latents
 
 
 class MessagePassing(nn.Module):
-    """Encode and Process: the node latents of a garment from features.
+    """Encode and Process (METHOD.md, Phi): from features to the node latents of a garment.
 
-    Running statistics of the features are in the collection `statistics`; `phi.observe` updates them.
+    The collection `statistics` has running statistics of the features; `phi.observe` updates them.
     """
 
     config: ModelConfig
@@ -206,7 +210,7 @@ class MessagePassing(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Features) -> Array:
-        """Node latents [V, W] of the garment."""
+        """Return the node latents [V, W] of the garment."""
         config, world = self.config, seen.world
         type_embedding = self.param("type_embedding", nn.initializers.normal(1.0), TYPES)
         level_embedding = self.param("level_embedding", nn.initializers.normal(1.0), LEVELS)
@@ -234,11 +238,11 @@ class MessagePassing(nn.Module):
             if config.body_nodes == "updated":
                 rows["world"]["to_body"] = scaled("world", world.to_body)
         latents = Encoder(config.width, config.mlp_layers, name="encoder")(rows)
-        beside = None
+        body = None
         if world is not None:
-            beside = World(latents["nodes"]["body"], world.slots, world.active, latents["world"])
+            body = World(latents["nodes"]["body"], world.slots, world.active, latents["world"])
         graphs = {name: graph._replace(edges=latents[name]) for name, graph in self.graphs.items()}
         processor = Processor(
             config.processor, config.width, config.mlp_layers, self.level, config.remat, self.block, name="processor"
         )
-        return processor(latents["nodes"]["garment"], graphs, beside)
+        return processor(latents["nodes"]["garment"], graphs, body)

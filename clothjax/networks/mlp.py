@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -14,7 +15,7 @@ CHUNK = 1024  # rows of an MLP at a time, where a CPU recomputes it: its layers 
 
 
 def scaled(gain: float) -> Callable:
-    """An initialiser of kernels with variance gain / inputs; the gain 2 suits a ReLU behind the layer."""
+    """Return an initialiser of kernels with variance gain / inputs; the gain 2 suits a ReLU behind the layer."""
     return nn.initializers.variance_scaling(gain, "fan_in", "truncated_normal")
 
 
@@ -22,7 +23,7 @@ def scaled(gain: float) -> Callable:
 
 
 class Dense(nn.Module):
-    """A dense layer whose kernel can be applied in parts: before what it reads is gathered or put side by side."""
+    """A dense layer whose kernel can be applied in parts, before its inputs are gathered or concatenated."""
 
     inputs: int
     outputs: int
@@ -32,17 +33,27 @@ class Dense(nn.Module):
         self.kernel = self.param("kernel", scaled(self.gain), (self.inputs, self.outputs))
         self.bias = self.param("bias", nn.initializers.zeros, (self.outputs,))
 
-    def __call__(self, x: Array) -> Array:
-        """[..., outputs] of x [..., inputs]."""
+    def __call__(self, x: Array) -> jax.Array:
+        """Return [..., outputs] of x [..., inputs]."""
         return self.product(x) + self.bias.reshape((1,) * (x.ndim - 1) + self.bias.shape)
 
-    def product(self, x: Array, begin: int = 0) -> Array:
-        """x [..., n] times the n rows of the kernel from `begin` on, without the bias."""
+    def product(self, x: Array, begin: int = 0) -> jax.Array:
+        """Multiply x [..., n] by the n rows of the kernel from `begin` on, without the bias."""
         return x @ self.kernel[begin : begin + x.shape[-1]]
 
 
+def apply(module: nn.Module, params: Params, *arguments: Any, **options: Any) -> Any:
+    """Return what a module with these parameters returns."""
+    return module.apply({"params": params}, *arguments, **options)
+
+
+def init(module: nn.Module, key: Any, *arguments: Any, **options: Any) -> Params:
+    """Return the initial parameters of a module, from a key and examples of its arguments."""
+    return dict(module.init(key, *arguments, **options)["params"])
+
+
 class LayerNorm(nn.Module):
-    """Rows [N, W] with mean 0 and variance 1, times a scale [W] plus a bias [W]."""
+    """A layer that brings rows [N, W] to mean 0 and variance 1, times a scale [W] plus a bias [W]."""
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -64,21 +75,21 @@ class MLP(nn.Module):
         self.layer_norm = LayerNorm(name="norm") if self.norm else None
 
     def __call__(self, x: Array) -> Array:
-        """[N, outputs] of x [N, inputs]; without a LayerNorm, [..., outputs] of [..., inputs]."""
+        """Return [N, outputs] of x [N, inputs]; without a LayerNorm, [..., outputs] of [..., inputs]."""
         return self.tail(self.dense[0](x))
 
     def tail(self, first: Array, in_chunks: bool = False) -> Array:
-        """The outputs from the pre-activation [N, W] of the first layer.
+        """Return the outputs from the pre-activation [N, W] of the first layer.
 
         Args:
-            in_chunks: some rows at a time, and nothing but `first` is kept for the backward pass.
+            in_chunks: take some rows at a time, and store nothing but `first` for the backward pass.
         """
         if in_chunks and not self.is_initializing():
             return self._in_chunks(first)
         x = first
         for layer in self.dense[1:]:
             x = layer(nn.relu(x))
-        return self.layer_norm(x) if self.norm else x
+        return x if self.layer_norm is None else self.layer_norm(x)
 
     @nn.nowrap
     def _in_chunks(self, first: Array) -> Array:
@@ -88,14 +99,17 @@ class MLP(nn.Module):
         parts = jnp.pad(first, ((0, chunks * rows - count), (0, 0))).reshape(chunks, rows, width)
         mlp, variables = self.unbind()
         tail = partial(mlp.apply, variables, method="tail")
-        done = jax.lax.map(jax.checkpoint(tail, prevent_cse=False), parts)
-        return done.reshape(chunks * rows, -1)[:count]
+        outputs = jax.lax.map(jax.checkpoint(tail, prevent_cse=False), parts)
+        return outputs.reshape(chunks * rows, -1)[:count]
 
 
 @jax.custom_vjp
 def _affine(x: Array, scale: Array, bias: Array) -> Array:
-    """x [N, W] times scale [W] plus bias [W]. Its gradient sums rows by a product: XLA's own sum took an eighth of a
-    training step on a CPU. A custom rule for the backward pass: there is no forward-mode derivative of it."""
+    """Return x [N, W] times scale [W] plus bias [W].
+
+    Its gradient sums rows by a product: XLA's own sum took an eighth of a training step on a CPU. The custom rule is
+    for the backward pass alone: it has no forward-mode derivative.
+    """
     return x * scale[None] + bias[None]
 
 
@@ -103,8 +117,8 @@ def _affine_forward(x, scale, bias):
     return _affine(x, scale, bias), (x, scale)
 
 
-def _affine_backward(kept, gradient):
-    x, scale = kept
+def _affine_backward(residuals, gradient):
+    x, scale = residuals
 
     def row_sum(rows):
         return jnp.matmul(jnp.ones((1, len(rows)), rows.dtype), rows, precision="highest")[0]

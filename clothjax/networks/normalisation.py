@@ -21,12 +21,12 @@ class Statistics(NamedTuple):
 
 
 def empty_statistics(columns: int) -> Statistics:
-    """Statistics of nothing yet: they leave features as they are."""
+    """Return statistics of no rows; they leave features as they are."""
     return Statistics(jnp.zeros(columns), jnp.ones(columns), jnp.zeros(()))
 
 
 def observe(statistics: Statistics, rows: Array, counted: Array | None = None) -> Statistics:
-    """Statistics that have also seen `rows` [N, columns], or those of them that are `counted` [N] bool.
+    """Return statistics that have also seen `rows` [N, columns], or only those that are `counted` [N] bool.
 
     Chan's update of mean and variance: E[x^2] - E[x]^2 would lose constant columns to rounding.
     """
@@ -46,18 +46,18 @@ def observe(statistics: Statistics, rows: Array, counted: Array | None = None) -
 
 
 def standardise(statistics: Statistics, rows: Array, bound: float = 10.0, least: float = 1e-6) -> Array:
-    """Features [N, columns] by mean and standard deviation, at least `least`, clipped to `bound` deviations."""
+    """Standardise features [N, columns] by mean and deviation, at least `least`; clip them to `bound` deviations."""
     deviation = jnp.sqrt(jnp.maximum(statistics.variance, least**2))
     return jnp.clip((rows - statistics.mean[None]) / deviation[None], -bound, bound)
 
 
-# what may be out of its range without being worth a word
-SLACK = 0.02  # of an input: m/s, m or of a rotation matrix
-CODE_SLACK = 0.1  # of a code or a constant, as they are normalised
+# inputs this far out of their range still count as inside
+SLACK = 0.02  # of an input: m/s, m or an entry of a rotation matrix
+CODE_SLACK = 0.1  # of a normalised code or constant
 
 
 class Scale(NamedTuple):
-    """How rows [N] are made comparable, and the range that is ordinary for them."""
+    """Mean and deviation to normalise rows [N] by, and the range seen in training."""
 
     mean: Array  # [N]
     deviation: Array  # [N]
@@ -73,35 +73,35 @@ class Normalizers(NamedTuple):
 
 
 def identity(size: int) -> Scale:
-    """The scale that leaves rows [N] as they are, whatever is in them."""
+    """Return the scale that leaves rows [N] as they are, with a range that holds any."""
     far = np.full(size, 1e6, np.float32)
     return Scale(np.zeros(size, np.float32), np.ones(size, np.float32), -far, far)
 
 
 def normalise(scale: Scale, row: Array) -> Array:
-    """A row [N] in standard deviations from the mean."""
+    """Express a row [N] in standard deviations from the mean."""
     return (row - scale.mean) / scale.deviation
 
 
 def denormalise(scale: Scale, row: Array) -> Array:
-    """The inverse of `normalise`."""
+    """Invert `normalise`."""
     return row * scale.deviation + scale.mean
 
 
 def bounded(row: Array, low: Array, high: Array, slack: Array | float = CODE_SLACK) -> tuple[Array, Array]:
-    """A row [N] brought into the range [low, high], NaN to its middle, and whether it was there but for `slack`."""
+    """Clip a row [N] to [low, high], NaN to the middle; also return whether it was inside but for `slack`."""
     inside = jnp.where(jnp.isnan(row), 0.5 * (low + high), jnp.clip(row, low, high))
     return inside, jnp.all(jnp.abs(inside - row) <= slack)
 
 
 def widened(scale: Scale, rows: np.ndarray) -> Scale:
-    """The same scale, with rows [n, N] within its range."""
+    """Return the same scale with its range widened to hold rows [n, N]."""
     rows = np.asarray(normalise(jax.tree.map(np.asarray, scale), rows))
     return scale._replace(low=np.minimum(scale.low, rows.min(0)), high=np.maximum(scale.high, rows.max(0)))
 
 
-def measure(rows: np.ndarray) -> Scale:
-    """The scale of rows [n, N]."""
+def measure(rows: Array) -> Scale:
+    """Measure the scale of rows [n, N]."""
     rows = np.asarray(rows, np.float64)
     mean, deviation = rows.mean(0), rows.std(0)
     # a column that never changed in training is left alone, not blown up

@@ -1,6 +1,7 @@
-"""Phi (METHOD.md, Phi): encode, process, convolve, decode. From a garment's state to the code of its next frame."""
+"""Phi (METHOD.md, Phi), from a garment's state to the code of its next frame: encode, process, convolve, decode."""
 
 from dataclasses import field
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 
 from clothjax.body import skinning
 from clothjax.config import MaterialConfig, ModelConfig
-from clothjax.networks import decoder, graph_features, message_passing, normalisation
+from clothjax.networks import decoder, graph_features, message_passing, mlp, normalisation
 from clothjax.networks.graph_features import Features
 from clothjax.networks.mesh_convolution import Convolution
 from clothjax.networks.message_passing import MessagePassing
@@ -25,7 +26,7 @@ DESCENT_BOUND = 0.3  # of a step of the descent, in Z
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
-    """Vertices left by the convolution and channels of each, so that their product L is nearest to config.latent."""
+    """Return how many vertices the convolution leaves, and channels each; the product L is nearest to config.latent."""
     left = scene.tables[-1].ids.shape[0] if scene.tables else scene.garment.vertices.shape[0]
     return left, max(1, round(config.latent / left))
 
@@ -34,7 +35,7 @@ class Phi(nn.Module):
     """Phi of a garment: from features of its state to the latent code of its next frame.
 
     Variables are `params` and the running `statistics` of the features. Blend shapes and the inverse Hessian are zero
-    at first: training measures what they start from.
+    at first: training measures their initial values.
     """
 
     config: ModelConfig
@@ -45,7 +46,7 @@ class Phi(nn.Module):
         config, scene = self.config, self.scene
         left, channels = latent_size(scene, config)
         pinned = np.asarray(scene.garment.pinned)
-        self.message_passing = MessagePassing(config, scene.graph, scene.level, pinned, self.block)
+        self.message_passing = MessagePassing(config, scene.graph, np.asarray(scene.level), pinned, self.block)
         nn.share_scope(self, self.message_passing)  # its parameters are beside the others, as in older models
         features = tuple(level.features or channels for level in config.convolution)
         self.convolution = Convolution(features, config.convolution_bases)
@@ -56,14 +57,14 @@ class Phi(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Features, guess: Array | float = 0.0) -> tuple[Array, Array]:
-        """The next code [L], as a change of a guess [L], and its canonical displacement [V, 3] m."""
+        """Return the next code [L], as a change of a guess [L], and its canonical displacement [V, 3] m."""
         if self.config.latent_update == "descent":
             self.param("inverse_hessian", nn.initializers.zeros, (self.garment.latent,) * 2)
         latent = guess + self.convolve(self.message_passing(seen))
         return latent, self.garment(latent, free(self.scene))
 
     def convolve(self, processed: Array) -> Array:
-        """Convolve: a latent code [L] from node latents [V, W]."""
+        """Convolve node latents [V, W] to a latent code [L]."""
         x = self.convolution(processed, self.scene.tables)
         if self.config.convolution[-1].features is not None:
             x = self.latent(x)
@@ -71,12 +72,12 @@ class Phi(nn.Module):
 
 
 def free(scene: Scene) -> Array:
-    """1 for a vertex that moves, 0 for one that is pinned [V]."""
+    """Return [V]: 1 for a vertex that moves, 0 for one that is pinned."""
     return jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
 
 
 def observe(statistics: dict[str, Statistics], seen: Features) -> dict[str, Statistics]:
-    """Statistics that have also seen a batch of features with leading axes [...]; body nodes count as nodes."""
+    """Return statistics that have also seen features with leading axes [...]; body nodes count as nodes."""
     return {
         name: normalisation.observe(
             statistics[name], jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
@@ -93,7 +94,7 @@ def step(
     config: ModelConfig,
     material: MaterialConfig,
 ) -> StepOutput:
-    """One step of Phi: the next positions, their latent code, and the features it saw.
+    """Take one step of Phi: return the next positions, their latent code, and the features.
 
     Args:
         model: `params` and `statistics`.
@@ -122,13 +123,14 @@ def step(
         config, material,
     )  # fmt: skip
     seen = jax.lax.stop_gradient(seen)
-    latent, displaced = Phi(config, scene).apply(model, seen, guess)
+    output: Any = Phi(config, scene).apply(model, seen, guess)
+    latent, displaced = output
     return StepOutput(decoder.vertices(displaced, character.template, window.following.garment), latent, seen)
 
 
 def decode(
     garment: Params, scene: Scene, character: Character, latent: Array, window: Window, config: ModelConfig
 ) -> Array:
-    """The next frame's vertices [V, 3] m of a latent code [L], by the decoder's parameters."""
-    displaced = decoder.of(garment, config).apply({"params": garment}, latent, free(scene))
+    """Decode a latent code [L] to the next frame's vertices [V, 3] m, by the decoder's parameters."""
+    displaced = mlp.apply(decoder.of(garment, config), garment, latent, free(scene))
     return decoder.vertices(displaced, character.template, window.following.garment)

@@ -1,4 +1,4 @@
-"""The devices that a training runs on: one, several of a machine, or those of several processes."""
+"""Devices to train on: one, several of a machine, or those of several processes."""
 
 import contextlib
 import os
@@ -19,14 +19,14 @@ Tree = TypeVar("Tree")
 
 
 def connect(processes: str = "") -> None:
-    """Joins this process to the others of its training, before anything is computed.
+    """Join this process to the others of its training, before anything is computed.
 
     Args:
-        processes: `ADDRESS:PORT,COUNT,INDEX` of the first process, of all, and of this one; `alone`; by default, those
-            of a SLURM, Open MPI (up to 4) or Kubernetes job (an indexed one), if there are several.
+        processes: `ADDRESS:PORT,COUNT,INDEX`: the address of the first process, their number, and the index of this
+            one; or `alone`. The default is the processes of a SLURM, Open MPI (up to 4) or indexed Kubernetes job.
 
     Raises:
-        ValueError: if `processes` is something else.
+        ValueError: if `processes` is neither.
     """
     if processes == "alone":
         return
@@ -46,7 +46,7 @@ def connect(processes: str = "") -> None:
 
 
 def _is_one_of_several() -> bool:
-    """Whether a launcher that jax knows started this process beside others. SLURM's batch script itself is alone."""
+    """Return whether a launcher that jax knows started other processes too. SLURM's batch script itself is alone."""
     slurm = int(os.environ.get("SLURM_STEP_NUM_TASKS", 1))
     mpi = int(os.environ.get("OMPI_COMM_WORLD_SIZE", 1)) if "OMPI_MCA_orte_hnp_uri" in os.environ else 1
     return max(slurm, mpi) > 1 or {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= os.environ.keys()
@@ -54,10 +54,10 @@ def _is_one_of_several() -> bool:
 
 @contextlib.contextmanager
 def together(directory: Path) -> Iterator[None]:
-    """Within it, of several processes none outlives an error in one: they cannot go on without each other.
+    """Exit this process at an error if it is one of several, which cannot go on without each other.
 
     Args:
-        directory: of the run, whose checkpoints are whole and can be resumed from.
+        directory: of the run; its checkpoints are complete, so training can resume from them.
     """
     try:
         yield
@@ -76,41 +76,44 @@ def together(directory: Path) -> Iterator[None]:
 
 
 def choose(wanted: str, *batches: int) -> Mesh | None:
-    """The devices to spread batches over; None for a single one.
+    """Return the devices to spread batches over; None for a single one.
 
     Args:
-        wanted: a number; or `auto`, as many as there are and every batch can be divided among.
+        wanted: a number of devices; or `auto`, the largest number that divides every batch.
+        batches: sizes of the batches.
 
     Raises:
-        ValueError: if there are not so many, a batch cannot be divided among them, or a process would have none.
+        ValueError: if there are fewer devices, they do not divide a batch, or a process would have none.
     """
-    there = jax.devices()
+    present = jax.devices()
     if wanted != "auto" and not (wanted.isdecimal() and int(wanted) > 0):
         raise ValueError(f"devices are a number or `auto`, not {wanted!r}")
     if wanted == "auto" and jax.process_count() == 1:
-        count = max(n for n in range(1, len(there) + 1) if not any(batch % n for batch in batches))
+        count = max(n for n in range(1, len(present) + 1) if not any(batch % n for batch in batches))
     else:
-        count = len(there) if wanted == "auto" else int(wanted)
-    if count > len(there):
-        raise ValueError(f"{count} devices are wanted, there are {len(there)}")
-    if jax.process_count() > 1 and count != len(there):
-        raise ValueError(f"{jax.process_count()} processes have {len(there)} devices and use all of them, not {count}")
+        count = len(present) if wanted == "auto" else int(wanted)
+    if count > len(present):
+        raise ValueError(f"{count} devices are wanted, there are {len(present)}")
+    if jax.process_count() > 1 and count != len(present):
+        raise ValueError(
+            f"{jax.process_count()} processes have {len(present)} devices and use all of them, not {count}"
+        )
     if any(batch % count for batch in batches):
         raise ValueError(
             f"batches of {' and '.join(map(str, batches))} cannot be divided among {count} devices: "
             "set stage1.batch, stage2.batch and tuning.batch to multiples"
         )
-    return None if count == 1 else Mesh(np.array(there[:count]), (AXIS,))
+    return None if count == 1 else Mesh(np.array(present[:count]), (AXIS,))
 
 
 def shard(function: Callable, device_mesh: Mesh | None) -> Callable:
-    """`function` of a batch, each device having a part: its first argument and its results have a leading axis [N]."""
+    """Return `function` with its first argument and results, which have a leading axis [N], split over devices."""
     if device_mesh is None:
         return function
 
     def run(batch, *others):
-        part, whole = PartitionSpec(AXIS), PartitionSpec()
-        specs = (part, *[whole] * len(others))
+        part, copy = PartitionSpec(AXIS), PartitionSpec()
+        specs = (part, *[copy] * len(others))
         # nothing is communicated within, so there is nothing to check
         each = jax.shard_map(function, mesh=device_mesh, in_specs=specs, out_specs=part, check_vma=False)
         return each(batch, *others)
@@ -119,17 +122,17 @@ def shard(function: Callable, device_mesh: Mesh | None) -> Callable:
 
 
 def replicated(device_mesh: Mesh | None) -> NamedSharding | None:
-    """The sharding of what every device has a copy of."""
+    """Return the sharding that gives every device a copy."""
     return None if device_mesh is None else NamedSharding(device_mesh, PartitionSpec())
 
 
 def replicate(tree: Tree, device_mesh: Mesh | None) -> Tree:
-    """The arrays of the first process on every device of all."""
+    """Copy the arrays of the first process to every device of all processes."""
     if device_mesh is None:
         return jax.tree.map(jnp.asarray, tree)
 
     def one(leaf):
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(one(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
         leaf = np.asarray(leaf)
         if jax.process_count() > 1:  # each has computed it, on another machine with other rounding

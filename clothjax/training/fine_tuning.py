@@ -1,4 +1,4 @@
-"""Psi after its regression, trained on by the physics of its own closed loop."""
+"""Fine-tuning: Psi trained further after its regression, by the physics of its own autoregressive rollouts."""
 
 import dataclasses
 
@@ -16,11 +16,14 @@ from clothjax.simulation.scene import Scene
 from clothjax.training import stage1, stage2
 from clothjax.types import Array
 
-DAMPING = 1e-3  # variances of normalised pose inputs; along half of their axes poses differ less
+DAMPING = 1e-3  # added to variances of normalised pose inputs; half of them are smaller
 
 
 def settings(config: Config) -> Config:
-    """The configuration with that of the tuning in the place of stage 1's: for its bodies, at its last loss weights."""
+    """Return the configuration with fine-tuning in the place of stage 1.
+
+    Bodies are drawn as in stage 1; loss weights stay at their last values.
+    """
     names = [field.name for field in dataclasses.fields(PhysicsTrainingConfig)]
     shared = {name: getattr(config.tuning, name) for name in names}
     stage = Stage1Config(**shared, betas=config.stage1.betas, start_timestep=0.0)
@@ -34,17 +37,17 @@ def settings(config: Config) -> Config:
 
 
 def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.TrainingState:
-    """The state before the first step."""
+    """Return the state before the first step."""
     key, pool_key = jax.random.split(jax.random.key(config.tuning.seed))
     clips = jax.tree.map(jnp.asarray, clips)
-    return stage1.starting(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
+    return stage1.initial_state(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
 
 
 def pose_preconditioner(poses: np.ndarray, power: float) -> Array:
-    """The matrix [P, P] for gradients by normalised pose inputs [n, P]: their inverse covariance to a power.
+    """Compute the matrix [P, P] for gradients by normalised pose inputs [n, P]: their inverse covariance to a power.
 
-    The three frames of a window are much alike: what tells velocities and accelerations is a thousandth and less of the
-    variance of the inputs, and without this is learnt late. Multiplied, inputs have the mean square that they had.
+    The three frames of a window are much alike: velocities and accelerations make up a thousandth or less of the
+    variance of the inputs, and are learnt late without this. The matrix preserves the mean square of the inputs.
     """
     covariance = np.cov(np.asarray(poses, np.float64).T)
     values, vectors = np.linalg.eigh(covariance)
@@ -54,10 +57,10 @@ def pose_preconditioner(poses: np.ndarray, power: float) -> Array:
 
 
 def code_preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: float) -> Array:
-    """The matrix [L, L] for gradients of normalised codes: an inverse Hessian to a power, without its scale.
+    """Compute the matrix [L, L] for gradients of normalised codes: an inverse Hessian to a power, without its scale.
 
     Args:
-        inverse: [L, L] in 1/J, of codes as they are.
+        inverse: [L, L] in 1/J, the inverse Hessian of codes that are not normalised.
     """
     deviation = np.asarray(normalizers.latent.deviation, np.float64)
     values, vectors = np.linalg.eigh(np.asarray(inverse, np.float64) / np.outer(deviation, deviation))
@@ -66,16 +69,16 @@ def code_preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: fl
 
 
 def preconditioners(
-    experiment: Experiment, reel: Clips, phi: dict, normalizers: Normalizers, kept: np.ndarray
+    experiment: Experiment, clips: Clips, phi: dict, normalizers: Normalizers, input_joints: np.ndarray
 ) -> Preconditioners | None:
-    """As configured, by the poses of a reel and the inverse Hessian of the descent of a Phi of these parameters."""
+    """Build both gradient preconditioners from the training poses and Phi's inverse Hessian; None if the power is 0."""
     config, power = experiment.config, experiment.config.tuning.preconditioning
     if power == 0:
         return None
-    poses = stage2.ordinary_poses(experiment.scene, reel, kept, config)
+    poses = stage2.ordinary_poses(experiment.scene, clips, input_joints, config)
     poses = jax.vmap(normalisation.normalise, (None, 0))(normalizers.pose, poses)
     inverse = phi.get("inverse_hessian")
     return Preconditioners(
-        pose=pose_preconditioner(poses, power),
+        pose=pose_preconditioner(np.asarray(poses), power),
         code=None if inverse is None else code_preconditioner(inverse, normalizers, power),
     )

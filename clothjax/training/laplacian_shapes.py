@@ -1,4 +1,4 @@
-"""Smooth blend shapes, and the network of springs that says how large a blend shape should be."""
+"""Smooth blend shapes, and the network of springs that determines their scale."""
 
 from typing import NamedTuple
 
@@ -14,25 +14,25 @@ from clothjax.geometry import topology
 from clothjax.physics import energies
 from clothjax.simulation.scene import Scene
 
-MEMBRANE = 0.25 * energies.THICKNESS  # m, of the springs that stand for a membrane
+MEMBRANE = 0.25 * energies.THICKNESS  # m, of the springs that model a membrane
 
 
 class Springs(NamedTuple):
-    """The rest shape as a network of springs: what a displacement costs, the same along x, y and z."""
+    """The rest shape as a network of springs, for the cost of a displacement along x, y or z."""
 
-    free: np.ndarray  # [F] the vertices that are not pinned
+    free: np.ndarray  # [F] vertices that are not pinned
     stiffness: scipy.sparse.csc_array  # [F, F] N/m, its Laplacian
     mass: np.ndarray  # [F] kg
     timestep: float  # s
 
     @property
     def matrix(self) -> scipy.sparse.csc_array:
-        """Stiffness and inertia together, [F, F] N/m."""
+        """Sum of stiffness and inertia, [F, F] N/m."""
         return (self.stiffness + scipy.sparse.diags_array(self.mass / self.timestep**2)).tocsc()
 
 
 def springs(scene: Scene, config: Config) -> Springs:
-    """The spring network of the configured cloth."""
+    """Build the spring network of the configured cloth."""
     cloth, count = config.material, len(scene.garment.vertices)
     edges = topology.edges(np.asarray(scene.garment.faces))
     free = np.flatnonzero(~np.asarray(scene.garment.pinned))
@@ -46,7 +46,7 @@ def springs(scene: Scene, config: Config) -> Springs:
 
 
 def laplacian(scene: Scene, config: Config) -> np.ndarray:
-    """Mass-scaled Laplacian eigenvectors, each along x, y and z: [K, V, 3] m.
+    """Compute mass-scaled Laplacian eigenvectors, each along x, y and z: [K, V, 3] m.
 
     Mode i is divided by sqrt(w_i + 1 / dt^2), so that a unit weight costs about the same energy in every mode. Pinned
     vertices do not move.
@@ -72,6 +72,6 @@ def laplacian(scene: Scene, config: Config) -> np.ndarray:
 
 
 def pad_basis(basis: np.ndarray, count: int) -> np.ndarray:
-    """As many shapes as are wanted, where fewer can be had the others do nothing."""
+    """Pad a basis [K, V, 3] m with zero shapes to `count`."""
     missing = np.zeros((count - len(basis), *basis.shape[1:]))
     return np.concatenate([basis, missing]).astype(np.float32)

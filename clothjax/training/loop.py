@@ -1,14 +1,12 @@
-"""The one training loop: progress, metrics, checkpoints, exact resume, and a stop where training diverges."""
+"""The training loop of all stages: progress, metrics, checkpoints, exact resume, a stop when training diverges."""
 
 import contextlib
 import json
 import math
-import os
 import signal
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -17,31 +15,29 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.experimental import multihost_utils
-from tqdm import tqdm
+from jax.sharding import Mesh
 
 from clothjax import progress
 from clothjax.files import checkpoint
-from clothjax.training import run_folder
+from clothjax.training import devices, run_folder, session
+from clothjax.training.session import Call
 
 State = TypeVar("State")
-MAX_NONFINITE = 10  # skipped steps in a row that are put up with
+Data = TypeVar("Data")
+MAX_NONFINITE = 10  # skipped steps in a row that are tolerated
 Metrics = dict[str, Any]
 
 
 class Fitted(NamedTuple):
-    """A finished training."""
+    """A training so far, or finished."""
 
     state: Any
     seconds: float  # in calls of `update`, over all sessions, without compilation
     compile_seconds: float  # the first call of each session, until it returned
 
-
-class _Call(NamedTuple):
-    state: Any
-    step: int  # after the call
-    metrics: Metrics
-    seconds: float  # without compilation
-    compile_seconds: float  # zero but for the first
+    def after(self, call: Call) -> "Fitted":
+        """Return the training after one more call."""
+        return Fitted(call.state, self.seconds + call.seconds, self.compile_seconds + call.compile_seconds)
 
 
 def fit(
@@ -61,29 +57,30 @@ def fit(
     report_seconds: float = 10.0,
     max_nonfinite: int = MAX_NONFINITE,
 ) -> Fitted:
-    """Trains to `steps`, going on from the directory's newest checkpoint if there is one.
+    """Train to `steps`, from the directory's newest checkpoint if there is one.
 
-    The directory gets `checkpoints/`, `metrics.jsonl` (one line a call: the median of every metric, its
-    maximum as `<name>_max`, the number of `nonfinite` steps, what `evaluate` returns) and `training.json`
-    (steps and seconds). All that the training depends on is in the state, so a run that is stopped at any
-    moment and resumed ends bit for bit as one that was not.
+    The directory gets `checkpoints/`, `metrics.jsonl` and `training.json` (steps and seconds). A line of the metrics
+    is a call: the median of every metric, its maximum as `<name>_max`, the number of `nonfinite` steps, the figures of
+    `evaluate`. The training depends on nothing but the state: a run that is stopped at any moment and
+    resumed ends bit for bit as one that was not.
 
     Args:
         update: a jitted function that takes `steps_per_call` steps; it may donate its argument. Its metrics
             are arrays [steps_per_call], among them `loss` and, if it skips updates with non-finite gradients,
-            `nonfinite`, which is not zero at these steps. Choose them for calls of about a second.
+            `nonfinite`, which is not zero at these steps. Choose `steps_per_call` for calls of about a second.
         state: the first state, a pytree with an integer `step` as a key or a field. It is used up.
-        config: what determines the training, as `configuration.to_dict` gives it; kept in every checkpoint.
-        description: one line for a person, kept there too.
+        config: what determines the training, as `configuration.to_dict` gives it; stored in every checkpoint.
+        description: one line for a person, stored there too.
         may_differ: dotted names in `config` whose values may change between the sessions of a run.
-        evaluate: figures of a state, taken about every `evaluate_steps` steps.
-        checkpoint_seconds: between two checkpoints, of which `keep` are kept; there is always one at the end.
+        evaluate: a function that returns figures of a state; called about every `evaluate_steps` steps.
+        checkpoint_seconds: between two checkpoints; there is always one at the end.
+        keep: number of checkpoints that stay.
         report_seconds: between two lines where there is no terminal to show a bar on.
-        max_nonfinite: skipped steps in a row that are put up with.
+        max_nonfinite: skipped steps in a row that are tolerated.
 
     Raises:
         ValueError: if the directory belongs to a run of another configuration or one under way, or if
-            `update` does not keep to the above.
+            `update` is not as described.
         FloatingPointError: if training diverges; the last good checkpoint stays.
         SystemExit: after SIGINT or SIGTERM, with a checkpoint saved.
     """
@@ -91,26 +88,18 @@ def fit(
     directory.mkdir(parents=True, exist_ok=True)
     checkpoints = directory / "checkpoints"
     config = json.loads(json.dumps(config))  # as it will be read back
-    leader = jax.process_index() == 0  # of several processes, the one that keeps records
-    lock = run_folder.lock(directory) if leader else contextlib.nullcontext()
+    lock = run_folder.lock(directory) if _keeps_records() else contextlib.nullcontext()
     stop = 0
-    with lock, _interrupts() as interrupted, _advice(checkpoints):
-        state = _resume(checkpoints, state, config, may_differ)
-        first = _step(state)
-        seconds, compile_seconds = run_folder.read_seconds(directory) if first else (0.0, 0.0)
-        rows = run_folder.metrics_file(directory, first) if leader else contextlib.nullcontext(lambda row: None)
+    with lock, session.interrupts() as interrupted, _advice(checkpoints):
+        fitted = _resume(directory, state, config, may_differ)
         saved = time.monotonic()
-        with rows as write, _progress(first, steps, report_seconds) as report:
-            for call in _calls(update, state, first, steps, steps_per_call, max_nonfinite):
-                state = call.state
-                seconds, compile_seconds = seconds + call.seconds, compile_seconds + call.compile_seconds
+        with _records(directory, _step(fitted.state), steps, report_seconds) as record:
+            for call in _calls(update, fitted.state, steps, steps_per_call, max_nonfinite):
+                fitted = fitted.after(call)
                 figures = _figures(call.metrics)
                 if evaluate and call.step // evaluate_steps > (call.step - steps_per_call) // evaluate_steps:
-                    figures |= {name: float(value) for name, value in evaluate(state).items()}
-                write({"step": call.step, "seconds": round(seconds, 3)} | figures)
-                if leader:
-                    run_folder.write_seconds(directory, seconds, compile_seconds, call.step, steps)
-                report(call, figures["loss"])
+                    figures |= {name: float(value) for name, value in evaluate(call.state).items()}
+                record(call, fitted, figures)
                 stop = _anywhere(interrupted())
                 due = _anywhere(time.monotonic() - saved >= checkpoint_seconds)
                 if stop or due or call.step == steps:
@@ -122,11 +111,11 @@ def fit(
         name = signal.Signals(stop).name
         progress.say(f"{name}: saved step {call.step} of {steps} in {directory}; run the same command again to go on")
         raise SystemExit(128 + stop)
-    return Fitted(state, seconds, compile_seconds)
+    return fitted
 
 
 class Weights(NamedTuple):
-    """What gradient descent changes."""
+    """The part of a training state that gradient descent changes."""
 
     params: Any
     average: Any  # exponential moving average of params
@@ -136,7 +125,7 @@ class Weights(NamedTuple):
 def update_weights(
     transform: optax.GradientTransformation, weights: Weights, loss: jax.Array, gradient: Any, ema: float
 ) -> tuple[Weights, Metrics]:
-    """One step of gradient descent; where the loss or a gradient is not finite, none.
+    """Take one step of gradient descent, or none if the loss or a gradient is not finite.
 
     Args:
         gradient: of `loss`, like weights.params; ema: decay of the average in a step.
@@ -159,10 +148,41 @@ def update_weights(
     return weights, {"loss": loss, "gradient_norm": norm, "nonfinite": ~good}
 
 
-def _calls(
-    update: Callable, state: Any, step: int, steps: int, steps_per_call: int, max_nonfinite: int
-) -> Iterator[_Call]:
-    """Calls `update` up to `steps`, and checks what comes back."""
+def apply_gradient(
+    transform: optax.GradientTransformation, state: Any, loss: jax.Array, gradient: Any, ema: float
+) -> tuple[Any, Metrics]:
+    """Return a training state after `update_weights` of its parameters, one step on, and the metrics.
+
+    Args:
+        state: a NamedTuple with the fields `step` and those of `Weights`.
+    """
+    weights, metrics = update_weights(
+        transform, Weights(state.params, state.average, state.optimizer), loss, gradient, ema
+    )
+    return state._replace(step=state.step + 1, **weights._asdict()), metrics
+
+
+def scan_steps(
+    train_step: Callable[[Data, State], tuple[State, Metrics]], data: Data, steps: int, device_mesh: Mesh | None
+) -> Callable[[State], tuple[State, Metrics]]:
+    """Return a jitted function that takes `steps` training steps, and their metrics [steps]; it donates its argument.
+
+    Args:
+        train_step: from the data and a state to the next state and its metrics.
+        data: copied to every device.
+    """
+
+    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
+    def update(state, data):
+        return jax.lax.scan(lambda state, _: train_step(data, state), state, None, length=steps)
+
+    data = devices.replicate(data, device_mesh)
+    return lambda state: update(state, data)
+
+
+def _calls(update: Callable, state: Any, steps: int, steps_per_call: int, max_nonfinite: int) -> Iterator[Call]:
+    """Call `update` up to `steps`, and check what comes back."""
+    step = _step(state)
     if steps_per_call < 1 or (steps - step) % steps_per_call:
         raise ValueError(f"steps_per_call {steps_per_call} does not divide the steps from {step} to {steps}")
     compile_seconds, skipped = None, 0
@@ -180,13 +200,16 @@ def _calls(
         skipped = check_finite(metrics, step, skipped, max_nonfinite)
         step += steps_per_call
         compile_seconds = returned - began if compile_seconds is None else 0.0
-        yield _Call(state, step, metrics, seconds - compile_seconds, compile_seconds)
+        yield Call(state, step, metrics, seconds - compile_seconds, compile_seconds)
 
 
 def check_finite(metrics: Metrics, step: int, skipped: int, allowed: int) -> int:
-    """The skipped steps in a row at the end of a call, given those before it.
+    """Count the skipped steps in a row at the end of a call, given those before it.
 
-    A step that was skipped did no harm, whatever its loss; one that was not and has no finite loss did.
+    A skipped step does no harm, whatever its loss.
+
+    Raises:
+        FloatingPointError: for a step that was taken with a loss that is not finite, or too many skipped in a row.
     """
     bad_loss = ~np.isfinite(metrics["loss"])
     for i, flag in enumerate(metrics.get("nonfinite", np.zeros(bad_loss.shape))):
@@ -203,7 +226,7 @@ def check_finite(metrics: Metrics, step: int, skipped: int, allowed: int) -> int
 
 
 def _terms(metrics: Metrics, index: int) -> str:
-    """Which metrics were not finite at a step of a call."""
+    """Name the metrics that were not finite at a step of a call, for an error message."""
     wrong = [name for name in metrics if name != "loss" and not np.isfinite(metrics[name][index])]
     return f" (not finite: {', '.join(wrong)})" if wrong else ""
 
@@ -213,7 +236,7 @@ def _step(state: Any) -> int:
 
 
 def _figures(metrics: Metrics) -> dict[str, float]:
-    """One number or two for each metric of a call, over its finite values."""
+    """Return the median and maximum of each metric of a call over its finite values; of `nonfinite`, the count."""
     figures = {}
     for name, values in metrics.items():
         if name == "nonfinite":
@@ -225,30 +248,70 @@ def _figures(metrics: Metrics) -> dict[str, float]:
     return figures
 
 
-def _resume(checkpoints: Path, state: Any, config: dict, may_differ: tuple[str, ...]) -> Any:
-    """The state of the newest undamaged checkpoint of this run; `state` where there is none yet."""
+def _resume(directory: Path, state: Any, config: dict, may_differ: tuple[str, ...]) -> Fitted:
+    """Find where training goes on, and the seconds that it took so far."""
+    # Three cases, in this order:
+    # 1. finished: the newest checkpoint is of the last step; it is read, and `fit` makes no call
+    # 2. checkpoint: there is one of this run; training goes on from the newest that is undamaged
+    # 3. start: there is none yet; training begins with `state`
+    checkpoints = directory / "checkpoints"
     newest = max(checkpoint.steps(checkpoints), default=0)
     if newest != _anywhere(newest) or newest != -_anywhere(-newest):
-        raise ValueError(f"{checkpoints.parent} must be on a file system that all processes of a training share")
+        raise ValueError(f"{directory} must be on a file system that all processes of a training share")
     if not checkpoint.steps(checkpoints):
-        return state
-    stored, here = _flat(checkpoint.latest(checkpoints).config), _flat(config)
+        return _so_far(directory, state)
+    _check_config(directory, checkpoint.latest(checkpoints).config, config, may_differ)
+    state, restored = checkpoint.restore(checkpoints, state)
+    if _keeps_records():
+        checkpoint.set_aside(checkpoints, restored.step)
+    progress.say(f"going on from step {restored.step} in {directory}")
+    return _so_far(directory, state)
+
+
+def _so_far(directory: Path, state: Any) -> Fitted:
+    return Fitted(state, *(run_folder.read_seconds(directory) if _step(state) else (0.0, 0.0)))
+
+
+def _check_config(directory: Path, stored: dict, config: dict, may_differ: tuple[str, ...]) -> None:
+    """Raise a ValueError if a run of another configuration is in the directory."""
+    there, here = _flat(stored), _flat(config)
     differ = [
-        f"{name}: {stored.get(name, 'absent')} there, {here.get(name, 'absent')} here"
-        for name in sorted(stored.keys() | here.keys())
-        if stored.get(name, "absent") != here.get(name, "absent")
+        f"{name}: {there.get(name, 'absent')} there, {here.get(name, 'absent')} here"
+        for name in sorted(there.keys() | here.keys())
+        if there.get(name, "absent") != here.get(name, "absent")
         and not any(name == free or name.startswith(f"{free}.") for free in may_differ)
     ]
     if differ:
         raise ValueError(
-            f"{checkpoints.parent} holds a run of another configuration ({'; '.join(differ)}): "
+            f"{directory} holds a run of another configuration ({'; '.join(differ)}): "
             "use another directory, or remove this one"
         )
-    state, found = checkpoint.restore(checkpoints, state)
-    if jax.process_index() == 0:
-        checkpoint.set_aside(checkpoints, found.step)
-    progress.say(f"going on from step {found.step} in {checkpoints.parent}")
-    return state
+
+
+@contextlib.contextmanager
+def _records(
+    directory: Path, first: int, steps: int, report_seconds: float
+) -> Iterator[Callable[[Call, Fitted, dict[str, float]], None]]:
+    """Yield a function that records a call, the training so far and the call's figures, in files and on the screen."""
+    if not _keeps_records():
+        yield lambda *_: None
+        return
+    with (
+        run_folder.metrics_file(directory, first) as write,
+        session.progress_report(first, steps, report_seconds) as report,
+    ):
+
+        def record(call: Call, fitted: Fitted, figures: dict[str, float]) -> None:
+            write({"step": call.step, "seconds": round(fitted.seconds, 3)} | figures)
+            run_folder.write_seconds(directory, fitted.seconds, fitted.compile_seconds, call.step, steps)
+            report(call, figures["loss"])
+
+        yield record
+
+
+def _keeps_records() -> bool:
+    """Return whether this is the process, of several, that keeps the run's folder."""
+    return jax.process_index() == 0
 
 
 def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -257,11 +320,11 @@ def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
     return {k: v for key in config for k, v in _flat(config[key], f"{prefix}.{key}" if prefix else key).items()}
 
 
-def _save(checkpoints: Path, call: _Call, config: dict, description: str, keep: int) -> None:
-    """A checkpoint, unless there is a NaN in the state."""
+def _save(checkpoints: Path, call: Call, config: dict, description: str, keep: int) -> None:
+    """Save a checkpoint; raise a FloatingPointError if there is a NaN in the state."""
     leaves = jax.tree_util.tree_flatten_with_path(call.state)[0]
     named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)}
-    bad = [name for name, found in jax.device_get(_any_nan(named)).items() if found]
+    bad = [name for name, has_nan in jax.device_get(_any_nan(named)).items() if has_nan]
     if bad:
         raise FloatingPointError(f"the state of step {call.step} has NaN in {', '.join(bad[:5])}")
     checkpoint.save(checkpoints, call.step, call.state, config, description, keep=keep)
@@ -274,7 +337,7 @@ def _any_nan(named: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 @contextlib.contextmanager
 def _advice(checkpoints: Path) -> Iterator[None]:
-    """Adds to a divergence what is left and what to do."""
+    """Add to the error of a divergence which checkpoint is left and what to do."""
     try:
         yield
     except FloatingPointError as error:
@@ -285,56 +348,8 @@ def _advice(checkpoints: Path) -> Iterator[None]:
         ) from error
 
 
-@contextlib.contextmanager
-def _interrupts() -> Iterator[Callable[[], int]]:
-    """A function that says which of SIGINT and SIGTERM has come, or 0. A second signal acts at once."""
-    received = []
-    before = {}
-
-    def note(number: int, frame: Any) -> None:
-        received.append(number)
-        signal.signal(number, before[number])
-        os.write(2, b"\nstopping after this call; once more to stop without saving\n")
-
-    if threading.current_thread() is threading.main_thread():  # elsewhere Python does not allow handlers
-        before.update({number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)})
-    try:
-        yield lambda: received[0] if received else 0
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _progress(first: int, steps: int, every: float) -> Iterator[Callable[[_Call, float], None]]:
-    """A function to report calls to: it moves a bar on a terminal, and writes lines elsewhere."""
-    terminal = sys.stdout.isatty()
-    seconds, spoken = 0.0, time.monotonic()
-    if jax.process_index() != 0:
-        yield lambda call, loss: None
-        return
-    if first < steps:
-        progress.say(f"training from step {first} to {steps}; compiling first")
-
-    def report(call: _Call, loss: float) -> None:
-        nonlocal seconds, spoken
-        seconds += call.seconds
-        if call.compile_seconds:
-            (bar.write if terminal else progress.say)(f"compiled in {call.compile_seconds:.1f} s")
-        bar.set_postfix(loss=f"{loss:.4g}", refresh=False)
-        bar.update(call.step - bar.n)
-        if not terminal and (call.step == steps or time.monotonic() - spoken >= every):
-            spoken = time.monotonic()
-            rate = (call.step - first) / max(seconds, 1e-9)
-            left = tqdm.format_interval((steps - call.step) / rate)
-            progress.say(f"step {call.step}/{steps}  loss {loss:.4g}  {rate:.4g} steps/s  {left} left")
-
-    with tqdm(total=steps, initial=first, unit="step", file=sys.stdout, disable=not terminal) as bar:
-        yield report
-
-
 def _anywhere(flag: int) -> int:
-    """The largest of the processes' flags, so that all of them take the same turn."""
+    """Return the largest of the processes' flags, so that all of them decide alike."""
     if jax.process_count() == 1:
         return flag
     return int(np.max(multihost_utils.process_allgather(np.int32(flag))))

@@ -1,4 +1,4 @@
-"""Loss weights and their ramps: terms of the potential in, one number out."""
+"""Loss weights and their ramps: from the terms of the potential to one number."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from clothjax.types import Array
 
 
 def weighing(config: LossConfig, training_step: Array) -> Callable[[dict[str, Array]], tuple[Array, dict[str, Array]]]:
-    """A function from the energies of a step in J to the training loss, and the energies that count."""
+    """Return a function from the energies of a step in J to the training loss and the energies in it."""
 
     def weigh(terms: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
         present = present_terms(terms, config)
@@ -19,19 +19,19 @@ def weighing(config: LossConfig, training_step: Array) -> Callable[[dict[str, Ar
 
 
 def present_terms(terms: dict[str, Array], config: LossConfig) -> dict[str, Array]:
-    """The terms whose weight is not always zero: the others are then not computed."""
+    """Return the terms whose weight is not always zero; the others are then not computed."""
     return {name: value for name, value in terms.items() if not getattr(config, name).absent}
 
 
 def weighted_loss(terms: dict[str, Array], config: LossConfig, training_step: Array) -> Array:
-    """The training loss: the weighted sum of terms in J over `config.scale`."""
+    """Compute the training loss: the weighted sum of terms in J over `config.scale`."""
     total = sum(loss_weight(getattr(config, name), training_step) * value for name, value in terms.items())
-    return total / config.scale
+    return jnp.asarray(total / config.scale)
 
 
 def loss_weight(ramp: Ramp, training_step: Array) -> Array | float:
-    """A loss weight at a training step."""
+    """Return a loss weight at a training step."""
     if ramp.end is None:
         return ramp.start
-    done = (training_step - ramp.first_step) / (ramp.last_step - ramp.first_step)
-    return ramp.start + (ramp.end - ramp.start) * jnp.clip(done, 0.0, 1.0)
+    progress = (training_step - ramp.first_step) / (ramp.last_step - ramp.first_step)
+    return ramp.start + (ramp.end - ramp.start) * jnp.clip(progress, 0.0, 1.0)

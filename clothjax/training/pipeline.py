@@ -1,7 +1,7 @@
-"""A run from start to end: blend shapes, stage 1, stage 2, fine-tuning. It resumes what was stopped.
+"""A run from start to end: blend shapes, stage 1, stage 2, fine-tuning. It resumes a run that was stopped.
 
-A phase whose checkpoint is at its last step is read, not trained again; one that was under way goes on from its last
-checkpoint; all else starts anew. What lies before stage 1 (blend shapes, preconditioner) is in its first checkpoint.
+A stage with a checkpoint at its last step is read, not trained again. A stage with an earlier checkpoint goes on from
+it. Any other stage starts anew. The first checkpoint of stage 1 contains the blend shapes and the preconditioner.
 """
 
 import time
@@ -47,7 +47,7 @@ MAY_DIFFER = {
 
 
 class Run(NamedTuple):
-    """What every phase of a training needs."""
+    """Experiment, folder, clips and devices of a run, for every stage of its training."""
 
     experiment: Experiment
     directory: Path
@@ -56,16 +56,16 @@ class Run(NamedTuple):
 
     @property
     def config(self) -> Config:
-        """The settings of the experiment."""
+        """Settings of the experiment."""
         return self.experiment.config
 
     def steps(self, stage: str) -> list[int]:
-        """Steps of a stage's checkpoints, in order."""
+        """Return the steps of a stage's checkpoints, in order."""
         return checkpoint.steps(self.directory / stage / "checkpoints")
 
 
 class Psi(NamedTuple):
-    """What fine-tuning starts from: a predictor, its scales, and the decoder with blend shapes of its Phi."""
+    """A predictor, its scales, and the decoder with blend shapes of its Phi; fine-tuning starts from it."""
 
     garment: dict
     predictor: dict
@@ -73,7 +73,7 @@ class Psi(NamedTuple):
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
-    """The folder of a run: as configured, or named after its configuration file, or without one after its garment."""
+    """Return the folder of a run: as configured, else named after its configuration file, else after its garment."""
     name = config.garment if argv[0].startswith("-") else argv[0]
     return Path(config.directory or Path("runs") / Path(name).stem)
 
@@ -117,7 +117,7 @@ def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) ->
 
 
 def train_phi(run: Run) -> loop.Fitted:
-    """Stage 1: blend shapes and preconditioner, then Phi on the physics."""
+    """Run stage 1: prepare blend shapes and preconditioner, then train Phi on the physics."""
     scene, config = run.experiment.scene, run.config
     began, new = time.monotonic(), not run.steps("stage1")
     state = stage1.init(scene, run.clips, config, _principal_shapes(run) if new else None)
@@ -134,16 +134,16 @@ def train_phi(run: Run) -> loop.Fitted:
 
 
 def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]]:
-    """Stage 2: rollouts of Phi, then Psi by regression on them; also return the seconds of the rollouts."""
+    """Run stage 2: roll Phi out, then train Psi by regression; also return the seconds of all that is not training."""
     scene, config = run.experiment.scene, run.config
     stage, joints = config.stage2, input_joints(run.experiment.names, config.stage2)
     model = {"params": phi.state.average, "statistics": phi.state.statistics}
     progress.say(f"stage 2: the latent predictor, {stage.steps} steps on {stage.sequences} rollouts of Phi")
     if run.steps("stage2")[-1:] == [stage.steps]:
-        # were it not readable, training would go on from the one before, and stop at the first NaN
+        # if it cannot be read, training goes on from the one before, and stops at the first NaN
         teacher, seconds = stage2.blank(model, scene, run.clips, joints, config), 0.0
     else:
-        if run.steps("tuning"):  # it must not be taken for this one's
+        if run.steps("tuning"):  # it must not be taken for that of the new stage 2
             raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
         with progress_bar("rolling out the teacher", stage.sequences) as report:
             teacher, seconds = stage2.teach(model, scene, run.clips, joints, config, report, run.device_mesh)
@@ -155,7 +155,7 @@ def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]
 
 
 def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
-    """Train Psi further, on the gradients of the energies.
+    """Fine-tune Psi on the gradients of the energies.
 
     Args:
         phi: parameters of Phi, whose preconditioner serves Psi too.
@@ -172,7 +172,7 @@ def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
 
 
 def train_baseline(run: Run) -> dict[str, float]:
-    """Train a baseline's network on the physics from its first step; it is kept where Phi would be, in `stage1/`."""
+    """Train a baseline's network on the physics from its first step; its folder is that of Phi, `stage1/`."""
     scene, config = run.experiment.scene, run.config
     name, began, new = config.peer.network, time.monotonic(), not run.steps("stage1")
     shapes = _principal_shapes(run) if new and name == "direct" else None
@@ -184,7 +184,7 @@ def train_baseline(run: Run) -> dict[str, float]:
     progress.say(f"{name} on the physics, {config.stage1.steps} steps")
     animator = animators.baseline_animator(joints)
     update = stage1.make_curriculum(scene, run.clips, config, STEPS_PER_CALL, run.device_mesh, animator)
-    state = stage1.init_peer(scene, run.clips, joints, shapes, config)
+    state = stage1.init_baseline(scene, run.clips, joints, shapes, config)
     fitted = _fit(run, "stage1", update, state, config.stage1.steps, f"{name}, {config.garment}", "baseline")
     return {"stage1_seconds": fitted.seconds, "compile_seconds": fitted.compile_seconds}
 
@@ -206,7 +206,7 @@ def _fit(
 
 
 def _principal_shapes(run: Run) -> np.ndarray | None:
-    """Principal shapes [K, V, 3] m, or None where the configuration asks for smooth ones."""
+    """Return principal shapes [K, V, 3] m, or None if the configuration asks for smooth ones."""
     sequences = run.config.shapes.sequences
     if sequences == 0:
         return None
@@ -216,7 +216,7 @@ def _principal_shapes(run: Run) -> np.ndarray | None:
 
 
 def _add_seconds(run: Run, **seconds: float) -> dict[str, float]:
-    """Add the time of what is not training to that in the run's folder; return the sums."""
+    """Add seconds that were not training to those in the run's folder; return the sums."""
     if jax.process_index() > 0:
         return seconds
     run.directory.mkdir(parents=True, exist_ok=True)

@@ -17,24 +17,24 @@ from clothjax.types import Array, ClothState, Material
 
 
 class Simulation(NamedTuple):
-    """One character under way. In the pool every leaf has a leading axis."""
+    """One simulation of a character. In the pool every leaf has a leading axis."""
 
     cloth: ClothState
     betas: Array  # [S]
     material: Material
-    frame: Array  # int32, of the clips
-    fresh: Array  # bool, before its quasi-static step
+    frame: Array  # int32, index into the clips
+    fresh: Array  # bool, true before its quasi-static step
 
 
 def dressed(scene: Scene, betas: Array, material: Material, config: Config) -> Character:
-    """The character of a simulation; where all of them share a shape or a material, these are constants."""
+    """Dress the character of a simulation; a shape or material that all simulations share is a constant."""
     fixed = config.stage1.betas == 0
     cloth = material if config.material.sample else configured_material(config)
     return characters.dress(scene, None if fixed else betas, cloth, config.physics)
 
 
 def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
-    """A new simulation: random clip and frame, betas and material, skinned."""
+    """Begin a simulation at a random frame, with random betas and material, from the skinned garment."""
     keys = jax.random.split(key, 3)
     betas = jax.random.uniform(
         keys[0], (scene.body.shapedirs.shape[-1],), minval=-config.stage1.betas, maxval=config.stage1.betas

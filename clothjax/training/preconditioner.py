@@ -1,4 +1,4 @@
-"""What makes Phi's descent short: the inverse of the Hessian that its potential has, on average, where cloth goes."""
+"""Preconditioner of Phi's descent: the inverse of its potential's mean Hessian over states of rollouts."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ from clothjax.simulation.scene import Scene
 from clothjax.training import pool, sampling
 from clothjax.types import Array
 
-FRAMES = 16  # of the closed loops at whose ends the Hessian is taken
+FRAMES = 16  # of the rollouts; the Hessian is taken at their ends
 
 
 def measure(
@@ -25,19 +25,21 @@ def measure(
     scene: Scene,
     clips: Clips,
     config: Config,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ) -> np.ndarray:
-    """The inverse mean Hessian [L, L] in 1/J at the ends of `model.descent_samples` short closed loops of Phi.
+    """Measure the inverse mean Hessian [L, L] in 1/J at the ends of `model.descent_samples` short rollouts of Phi.
 
-    Each is of its own clip, betas and material. Other than the Hessian at rest it knows what contact, tension and the
-    weight of the body's turns make of the cloth. Directions in which a Hessian is negative count as flat.
+    Each rollout has its own clip, betas and material. Unlike the Hessian at rest, this one includes contact, tension
+    and inertia of a moving body. Directions in which a Hessian is negative count as flat.
 
     Args:
         model: Phi's `params`, with any preconditioner, and `statistics`.
+        progress: called with the number of rollouts done.
+        device_mesh: each device rolls out a part of them.
 
     Raises:
-        ValueError: if no loop stayed finite.
+        ValueError: if no rollout stayed finite.
     """
 
     def sequence(key: Array, model: dict, clips: Clips) -> Array:
@@ -49,7 +51,7 @@ def measure(
         )
         state, last = jax.tree.map(lambda x: x[-1], (states, poses))
         window = characters.window(scene, character, last)
-        step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config)
+        step = time_step.time_step(scene, character, state, window, jnp.asarray(1.0 / config.fps), config)
 
         def energy(latent: Array) -> Array:
             new = phi.decode(model["params"]["garment"], scene, character, latent, window, config.model)
@@ -58,13 +60,13 @@ def measure(
         return descent.nearest_convex(descent.hessian(energy, latents[-1]))
 
     clips = jax.tree.map(jnp.asarray, clips)
-    found = sampling.sample(
+    hessians = sampling.sample(
         sequence, (model, clips), config.model.descent_samples, config.stage1.seed, progress, device_mesh
     )
-    good = np.isfinite(found).all(axis=(1, 2))
+    good = np.isfinite(hessians).all(axis=(1, 2))
     if not good.any():
         raise ValueError(
-            "no closed loop of an untrained Phi stayed finite: look at the garment on the body, or set "
+            "no rollout of an untrained Phi stayed finite: look at the garment on the body, or set "
             "model.descent_samples: 0 to descend by the Hessian at rest"
         )
-    return np.asarray(descent.regularised_inverse(found[good].mean(axis=0), config.model.descent_damping))
+    return np.asarray(descent.regularised_inverse(hessians[good].mean(axis=0), config.model.descent_damping))

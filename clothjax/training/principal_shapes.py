@@ -1,4 +1,4 @@
-"""Blend shapes to start training from: the principal components of cloth that only the physics moves."""
+"""Initial blend shapes: the principal components of simulated cloth, without a network."""
 
 from collections.abc import Callable
 
@@ -18,23 +18,23 @@ from clothjax.simulation.scene import Scene
 from clothjax.training import laplacian_shapes, pool, sampling
 from clothjax.types import Array
 
-LARGEST = 12000  # vertices whose springs have an inverse that fits into memory
-FARTHEST = 0.4  # m, a sequence in which a vertex is displaced farther is left out
-BOUND = 1.0  # m, length of a step of all vertices together
+MAX_VERTICES = 12000  # the inverse of the springs of more does not fit into memory
+MAX_DISPLACEMENT = 0.4  # m; a sequence in which a vertex is displaced farther is left out
+MAX_STEP = 1.0  # m, length of a descent step of all vertices together
 
 
 def principal(
     scene: Scene,
     clips: Clips,
     config: Config,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ) -> np.ndarray:
-    """Principal components [K, V, 3] m of `simulate`, as large as those of `blendshapes.laplacian`."""
+    """Compute principal components [K, V, 3] m of `simulate`, with the scale of `laplacian_shapes.laplacian`."""
     frames = simulate(scene, clips, config, progress, device_mesh)
     rows = frames.reshape(-1, frames[0, 0].size).astype(np.float64)
     count = min(config.model.blendshapes, len(rows), rows.shape[1])
-    # of the smaller of the two products; the mean is one of the components
+    # eigenvectors of the smaller of the two products; the mean is one of the components
     if len(rows) < rows.shape[1]:
         vectors = scipy.linalg.eigh(rows @ rows.T, subset_by_index=[len(rows) - count, len(rows) - 1])[1]
         shapes = vectors.T @ rows
@@ -52,22 +52,22 @@ def simulate(
     scene: Scene,
     clips: Clips,
     config: Config,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ) -> np.ndarray:
-    """Canonical displacements [N, T, V, 3] m of cloth whose every vertex is free, in random closed loops.
+    """Simulate cloth on random clips, bodies and materials: canonical displacements [N, T, V, 3] m.
 
-    Each step is a few conjugate-gradient steps down the same potential that trains Phi. Sequences that went wrong are
-    left out.
+    Each step is a few conjugate-gradient steps of all vertices down the potential that trains Phi. Sequences that
+    diverged are left out.
 
     Raises:
-        ValueError: for a garment of too many vertices, or if all sequences went wrong.
+        ValueError: for a garment of too many vertices, or if all sequences diverged.
     """
     settings, network = config.shapes, laplacian_shapes.springs(scene, config)
     count = len(scene.garment.vertices)
-    if count > LARGEST:
+    if count > MAX_VERTICES:
         raise ValueError(
-            f"principal shapes of a garment of {count} vertices need too much memory (the most is {LARGEST}): "
+            f"principal shapes of a garment of {count} vertices need too much memory (the most is {MAX_VERTICES}): "
             "set shapes.sequences: 0 for smooth ones"
         )
     inverse = np.zeros((count, count), np.float32)
@@ -87,7 +87,7 @@ def simulate(
                 return skinning.apply(following, character.template + displacement.reshape(-1, 3))
 
             now = (skinning.unapply(current, inputs.state.position) - character.template).reshape(-1)
-            new = descent.descend(precondition, now, garment, inputs.potential, settings.descent_steps, BOUND)
+            new = descent.descend(precondition, now, garment, inputs.potential, settings.descent_steps, MAX_STEP)
             return StepOutput(garment(new), inputs.state.latent)
 
         poses = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
@@ -104,11 +104,11 @@ def simulate(
         return jax.lax.scan(frame, state, poses)[1]
 
     arguments = (jax.tree.map(jnp.asarray, clips), jnp.asarray(inverse))
-    found = sampling.sample(sequence, arguments, settings.sequences, settings.seed, progress, device_mesh)
-    good = np.abs(found).max(axis=(1, 2, 3)) < FARTHEST
+    displacements = sampling.sample(sequence, arguments, settings.sequences, settings.seed, progress, device_mesh)
+    good = np.abs(displacements).max(axis=(1, 2, 3)) < MAX_DISPLACEMENT
     if not good.any():
         raise ValueError(
-            "all of the cloth that shapes should be taken from blew up or fell off: look at the garment on the body, "
+            f"all {len(good)} simulations for the blend shapes diverged or slid off: look at the garment on the body, "
             "or set shapes.sequences: 0 for smooth ones"
         )
-    return found[good]
+    return displacements[good]

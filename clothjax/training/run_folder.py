@@ -1,4 +1,4 @@
-"""What a training run keeps in its folder besides checkpoints: its lock, its metrics and the time it took."""
+"""Files in the folder of a training run besides checkpoints: the lock, the metrics and the time."""
 
 import contextlib
 import json
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def lock(directory: Path) -> Iterator[None]:
-    """Held while a run trains in the directory. The system lets go of it however the process ends.
+    """Hold a lock on the directory while a run trains in it. The system releases it however the process ends.
 
     Raises:
         ValueError: if another run holds it.
@@ -33,17 +33,17 @@ def lock(directory: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, float]], None]]:
-    """A function that appends rows to `metrics.jsonl`, which first loses those after `step`."""
+    """Yield a function that appends rows to `metrics.jsonl`; rows after `step` are dropped first."""
     path = directory / "metrics.jsonl"
-    kept = []
+    lines = []
     for line in path.read_text().splitlines() if path.exists() else []:
         try:
             if json.loads(line)["step"] > step:
                 break
         except json.JSONDecodeError:  # the line that a killed process was writing
             break
-        kept.append(line + "\n")
-    _replace(path, "".join(kept))
+        lines.append(line + "\n")
+    _replace(path, "".join(lines))
     with open(path, "a") as file:
 
         def write(row: dict[str, float]) -> None:
@@ -55,7 +55,7 @@ def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, flo
 
 
 def read_seconds(directory: Path) -> tuple[float, float]:
-    """Seconds and compile seconds of all sessions so far, with what they lost again; 0 if unknown."""
+    """Return seconds and compile seconds of all sessions so far, lost steps included; 0 if unknown."""
     path = directory / "training.json"
     if not path.exists():
         return 0.0, 0.0
@@ -64,13 +64,13 @@ def read_seconds(directory: Path) -> tuple[float, float]:
 
 
 def write_seconds(directory: Path, seconds: float, compile_seconds: float, step: int, steps: int) -> None:
-    """Keeps the time spent up to `step` of `steps` in `training.json`."""
+    """Write the time spent up to `step` of `steps` to `training.json`."""
     record = {"step": step, "steps": steps, "seconds": seconds, "compile_seconds": compile_seconds}
     _replace(directory / "training.json", json.dumps(record) + "\n")
 
 
 def add_seconds(directory: Path, **spent: float) -> dict[str, float]:
-    """Adds to the seconds that parts of a run took in all its sessions, kept in `clock.json`; returns these."""
+    """Add to the seconds in `clock.json` that parts of a run took in all sessions; return the sums."""
     path = directory / "clock.json"
     total = json.loads(path.read_text()) if path.exists() else {}
     total |= {name: total.get(name, 0.0) + seconds for name, seconds in spent.items()}
@@ -79,7 +79,7 @@ def add_seconds(directory: Path, **spent: float) -> dict[str, float]:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Writes a file whole or not at all."""
+    """Write a file completely or not at all."""
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text)
     partial.replace(path)

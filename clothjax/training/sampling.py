@@ -1,4 +1,4 @@
-"""Many closed loops side by side, each of its own random clip, body and material."""
+"""Batches of rollouts, each with its own random clip, body and material."""
 
 import os
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 
 from clothjax.training import devices
 
-ON_CPU, ELSEWHERE = 4, 64  # sequences in one program
+ON_CPU, ELSEWHERE = 4, 64  # sequences in one program, by device
 
 
 def sample(
@@ -19,18 +19,18 @@ def sample(
     arguments: tuple,
     count: int,
     seed: int,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ):
-    """`sequence(key, *arguments)` for `count` keys of a seed, stacked, on the host.
+    """Return `sequence(key, *arguments)` for `count` keys of a seed, stacked, on the host.
 
     Args:
+        sequence: a function that jax can transform.
         progress: called with the number of sequences done.
         device_mesh: each device runs a part of them.
     """
-    alone = device_mesh is None
     on_cpu = jax.default_backend() == "cpu"
-    among = 1 if alone else device_mesh.size
+    among = 1 if device_mesh is None else device_mesh.size
     size = among * min(ON_CPU if on_cpu else ELSEWHERE, -(-count // among))
     arguments = devices.replicate(arguments, device_mesh)
     keys = jax.random.split(jax.random.key(seed), count)
@@ -39,14 +39,14 @@ def sample(
     def run(keys, *arguments):
         return devices.shard(jax.vmap(sequence, (0, *(None for _ in arguments))), device_mesh)(keys, *arguments)
 
-    def some(start: int):
+    def part_from(start: int):
         rows = np.arange(start, start + size) % count
         return jax.device_get(run(devices.replicate(keys[rows], device_mesh), *arguments))
 
     parts = []
     # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
-    with ThreadPoolExecutor(os.cpu_count() if on_cpu and alone else 1) as pool:
-        for part in pool.map(some, range(0, count, size)):
+    with ThreadPoolExecutor(os.cpu_count() if on_cpu and device_mesh is None else 1) as pool:
+        for part in pool.map(part_from, range(0, count, size)):
             parts.append(part)
             progress(min(len(parts) * size, count))
     return jax.tree.map(lambda *each: np.concatenate(each)[:count], *parts)

@@ -12,9 +12,9 @@ from jax.sharding import Mesh
 
 from clothjax.body import motion_clips
 from clothjax.body.motion_clips import Clips
-from clothjax.config import Config
+from clothjax.config import Config, Stage1Config
 from clothjax.material import configured_material
-from clothjax.networks import animators, baselines, decoder, graph_features, phi, psi
+from clothjax.networks import animators, baselines, decoder, graph_features, mlp, phi, psi
 from clothjax.networks.animators import MakeAnimator
 from clothjax.networks.graph_features import Features
 from clothjax.physics import descent
@@ -23,16 +23,16 @@ from clothjax.simulation import characters, rollout, time_step
 from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.scene import Scene
 from clothjax.training import devices, laplacian_shapes, loop
-from clothjax.training.loop import Weights
 from clothjax.training.loss import weighing
 from clothjax.training.pool import Simulation, begin, dressed
-from clothjax.types import Array
+from clothjax.types import Array, ClothState
 
 NORMALIZER_STEPS = 2000  # over which the feature statistics are collected; then they are frozen
+MAX_DISTANCE = 5.0  # m from the root, where cloth counts as lost
 
 
 class TrainingState(NamedTuple):
-    """All that stage 1 is at a step: resuming from it is exact."""
+    """State of stage 1 at a step; resuming from it is exact."""
 
     step: Array  # int32
     key: Array
@@ -44,20 +44,20 @@ class TrainingState(NamedTuple):
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam behind a clipped norm, at a rate that is constant, then decays; slower for the blend shapes."""
+    """Build Adam with a clipped norm; its rate is constant, then decays, and is lower for the blend shapes."""
     stage = config.stage1
-    hold = max(1, int(stage.decay_start * stage.steps))
+    constant_steps = max(1, int(stage.decay_start * stage.steps))
     decay = optax.exponential_decay(
         stage.learning_rate,
-        max(1, stage.steps - hold),
+        max(1, stage.steps - constant_steps),
         stage.decay_end,
         end_value=stage.learning_rate * stage.decay_end,
     )
-    warm = min(200, hold)
+    warmup_steps = min(200, constant_steps)
     schedule = optax.join_schedules(
-        [optax.linear_schedule(0.01 * stage.learning_rate, stage.learning_rate, warm),
+        [optax.linear_schedule(0.01 * stage.learning_rate, stage.learning_rate, warmup_steps),
          optax.constant_schedule(stage.learning_rate), decay],
-        [warm, hold],
+        [warmup_steps, constant_steps],
     )  # fmt: skip
 
     def slower(updates):
@@ -74,7 +74,11 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None) -> TrainingState:
-    """The state before the first step; `shapes` [K, V, 3] m start the blend shapes, by default smooth ones."""
+    """Return the state before the first step.
+
+    Args:
+        shapes: [K, V, 3] m, initial blend shapes; smooth ones by default.
+    """
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     basis = laplacian_shapes.laplacian(scene, config) if shapes is None else shapes
@@ -86,27 +90,28 @@ def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None
     params["garment"]["blendshapes"] = jnp.asarray(0.1 * basis)
     if config.model.latent_update == "descent":
         params["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(params["garment"])
-    return starting(params, model["statistics"], key, pool_key, scene, clips, config)
+    return initial_state(params, model["statistics"], key, pool_key, scene, clips, config)
 
 
-def init_peer(scene: Scene, clips: Clips, kept: np.ndarray, shapes: Array, config: Config) -> TrainingState:
-    """The state before the first step of a peer's network, on the joints `kept`.
+def init_baseline(scene: Scene, clips: Clips, input_joints: np.ndarray, shapes: Array, config: Config) -> TrainingState:
+    """Return the state before the first step of a baseline's network.
 
     Args:
+        input_joints: indices of the joints that are inputs.
         shapes: [K, V, 3] m, blend shapes for Psi without stage 1 to start from.
     """
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     betas = jnp.zeros(scene.body.shapedirs.shape[-1])
     constants = psi.constant_inputs(betas, configured_material(config), config.material)
-    params = jax.jit(lambda k: baselines.init(k, len(kept), len(constants), shapes, config))(model_key)
-    return starting(params, {}, key, pool_key, scene, clips, config)
+    params = jax.jit(lambda k: baselines.init(k, len(input_joints), len(constants), shapes, config))(model_key)
+    return initial_state(params, {}, key, pool_key, scene, clips, config)
 
 
-def starting(
+def initial_state(
     params: dict, statistics: dict, key: Array, pool_key: Array, scene: Scene, clips: Clips, config: Config
 ) -> TrainingState:
-    """The state before the first step of training such parameters."""
+    """Return the state before the first step of training these parameters."""
     pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(jax.random.split(pool_key, config.stage1.pool))
     return TrainingState(
         step=jnp.int32(0),
@@ -120,7 +125,7 @@ def starting(
 
 
 def preconditioned(state: TrainingState, inverse: Array) -> TrainingState:
-    """A state before the first step, with another preconditioner [L, L] of Phi's descent."""
+    """Return a state before the first step, with another preconditioner [L, L] of Phi's descent."""
     return state._replace(
         params=state.params | {"inverse_hessian": jnp.array(inverse)},
         average=state.average | {"inverse_hessian": jnp.array(inverse)},
@@ -128,20 +133,20 @@ def preconditioned(state: TrainingState, inverse: Array) -> TrainingState:
 
 
 def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
-    """The inverse Hessian [L, L] in 1/J of `rollout.rest_energy` over codes near zero."""
+    """Compute the inverse Hessian [L, L] in 1/J of `time_step.rest_energy` over codes near zero."""
     energy = time_step.rest_energy(scene, config)
     network = decoder.of(garment, config.model)
 
-    def of_code(latent):
-        return energy(network.apply({"params": garment}, latent, phi.free(scene)))
+    def energy_of_code(latent):
+        return energy(mlp.apply(network, garment, latent, phi.free(scene)))
 
     return descent.regularised_inverse(
-        descent.hessian(of_code, jnp.zeros(network.latent)), config.model.descent_damping
+        descent.hessian(energy_of_code, jnp.zeros(network.latent)), config.model.descent_damping
     )
 
 
 class FirstStep(NamedTuple):
-    """A step of a new simulation, and what Phi sees of it."""
+    """A step of a new simulation, and the features of it."""
 
     character: Character
     window: Window
@@ -150,22 +155,33 @@ class FirstStep(NamedTuple):
 
 
 def first_step(scene: Scene, simulation: Simulation, clips: Clips, config: Config) -> FirstStep:
-    """The first step of a simulation, with the garment held where it is for a guess."""
+    """Take the first step of a simulation, with the present positions as the guess of the next."""
     character = dressed(scene, simulation.betas, simulation.material, config)
     window = characters.window(scene, character, motion_clips.poses(clips, simulation.frame))
-    step = time_step.time_step(scene, character, simulation.cloth, window, 1.0 / config.fps, config)
-    held = simulation.cloth.position
+    step = time_step.time_step(scene, character, simulation.cloth, window, jnp.asarray(1.0 / config.fps), config)
+    guess = simulation.cloth.position
     seen = graph_features.compute(
-        scene, character, simulation.cloth, window, step.contact, step.timestep, held, 0.0 * held,
+        scene, character, simulation.cloth, window, step.contact, step.timestep, guess, 0.0 * guess,
         config.model, config.material,
     )  # fmt: skip
     return FirstStep(character, window, step, seen)
 
 
 def rollout_length(step: int, config: Config) -> int:
-    """Frames of one update at a training step: the curriculum."""
+    """Return the frames of one rollout at a training step (the curriculum)."""
     stage = config.stage1
     return min(max(stage.rollout, stage.rollout_end), stage.rollout + step // stage.rollout_every)
+
+
+class Problem(NamedTuple):
+    """Constants of a training: the same at every step."""
+
+    scene: Scene
+    config: Config
+    frames: int  # of a rollout
+    transform: optax.GradientTransformation
+    animator: MakeAnimator
+    device_mesh: Mesh | None
 
 
 def make_curriculum(
@@ -176,14 +192,14 @@ def make_curriculum(
     device_mesh: Mesh | None = None,
     animator: MakeAnimator = animators.phi_animator,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """`make_update` with the rollout growing as training proceeds; one compilation for each length."""
-    made = {}
+    """Return `make_update` with rollouts that grow as training proceeds; one compilation for each length."""
+    updates = {}
 
     def update(state: TrainingState):
         frames = rollout_length(int(state.step), config)
-        if frames not in made:
-            made[frames] = make_update(scene, clips, config, frames, steps, device_mesh, animator)
-        return made[frames](state)
+        if frames not in updates:
+            updates[frames] = make_update(scene, clips, config, frames, steps, device_mesh, animator)
+        return updates[frames](state)
 
     return update
 
@@ -197,78 +213,43 @@ def make_update(
     device_mesh: Mesh | None = None,
     animator: MakeAnimator = animators.phi_animator,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """A jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
+    """Return a jitted function that takes `steps` training steps of `frames` frames, and their metrics [steps].
 
     It consumes its argument (buffers are donated). The simulations of a batch are spread over the devices.
 
     Args:
-        animator: what is trained, made of its `params` and `statistics`.
+        animator: makes what is trained, of its `params` and `statistics`.
     """
-    stage = config.stage1
-    transform = optimizer(config)
-
-    def part(simulations, params, statistics, step, clips):
-        def loss(params, simulation):
-            character = dressed(scene, simulation.betas, simulation.material, config)
-            animate = animator({"params": params, "statistics": statistics}, scene, character, config)
-            return rollout.training_rollout(
-                animate, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
-                frames, config, weighing(config.loss, step),
-            )  # fmt: skip
-
-        found, gradient = losses_and_gradient(loss, params, simulations)
-        return found, jax.tree.map(lambda x: x[None], gradient)
-
-    def one(clips: Clips, state: TrainingState, _):
-        chosen, simulations = turn(state, scene, clips, frames, config)
-        (each, (cloth, terms, seen)), gradients = devices.shard(part, device_mesh)(
-            simulations, state.params, state.statistics, state.step, clips
-        )
-        weights, metrics = loop.update_weights(
-            transform,
-            Weights(state.params, state.average, state.optimizer),
-            jnp.mean(each),
-            jax.tree.map(lambda x: jnp.mean(x, axis=0), gradients),  # over devices
-            stage.ema,
-        )
-        # a lost simulation starts anew at its next turn; so does one whose update was skipped
-        lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < 5.0)
-        lost |= ~(each < (jnp.inf if stage.lost is None else stage.lost))
-        advance = jnp.where(simulations.fresh, frames - 1, frames)
-        frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advance)
-        cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
-        following = Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
-
-        statistics = state.statistics
-        if seen is not None:
-            statistics = jax.lax.cond(
-                metrics["nonfinite"] | (state.step >= NORMALIZER_STEPS),
-                lambda statistics, _: statistics,
-                phi.observe,
-                statistics,
-                seen,
-            )
-        new = TrainingState(
-            step=state.step + 1,
-            key=state.key,
-            **weights._asdict(),
-            statistics=statistics,
-            pool=jax.tree.map(lambda pool, value: pool.at[chosen].set(value), state.pool, following),
-        )
-        metrics["lost"] = jnp.sum(lost)
-        metrics |= {name: jnp.mean(values) for name, values in terms.items()}
-        return new, metrics
-
-    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
-    def update(state, clips):
-        return jax.lax.scan(partial(one, clips), state, None, length=steps)
-
-    clips = devices.replicate(clips, device_mesh)
-    return lambda state: update(state, clips)
+    problem = Problem(scene, config, frames, optimizer(config), animator, device_mesh)
+    return loop.scan_steps(partial(train_step, problem), clips, steps, device_mesh)
 
 
-def turn(state: TrainingState, scene: Scene, clips: Clips, frames: int, config: Config) -> tuple[Array, Simulation]:
-    """The simulations [B] whose turn it is, and their places [B] in the pool; begun anew where that is due."""
+def train_step(problem: Problem, clips: Clips, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
+    """Take one step: roll a batch out, descend, then write the simulations back; also return the metrics."""
+    stage = problem.config.stage1
+    chosen, simulations = next_batch(state, problem.scene, clips, problem.frames, problem.config)
+    rollouts = devices.shard(partial(batch_gradient, problem), problem.device_mesh)
+    (losses, (cloth, terms, seen)), gradients = rollouts(simulations, state.params, state.statistics, state.step, clips)
+    new, metrics = loop.apply_gradient(
+        problem.transform,
+        state,
+        jnp.mean(losses),
+        jax.tree.map(lambda x: jnp.mean(x, axis=0), gradients),  # over devices
+        stage.ema,
+    )
+    lost = reset_mask(cloth, losses, stage)
+    moved = advance(simulations, cloth, lost, clips, problem.frames)
+    if seen is not None:
+        new = new._replace(statistics=observe(state, seen, metrics["nonfinite"]))
+    new = new._replace(pool=jax.tree.map(lambda pool, value: pool.at[chosen].set(value), state.pool, moved))
+    metrics["lost"] = jnp.sum(lost)
+    return new, metrics | {name: jnp.mean(values) for name, values in terms.items()}
+
+
+def next_batch(
+    state: TrainingState, scene: Scene, clips: Clips, frames: int, config: Config
+) -> tuple[Array, Simulation]:
+    """Return places [B] in the pool and the simulations [B] there, begun anew if their clip ends or chance has it."""
     stage = config.stage1
     begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
     chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
@@ -283,16 +264,60 @@ def turn(state: TrainingState, scene: Scene, clips: Clips, frames: int, config: 
     return chosen, jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
 
 
-def losses_and_gradient(loss: Callable, params: dict, batch):
-    """Losses [N] of the elements of a batch with all else that `loss` returns, and the gradient of their mean.
+def batch_gradient(
+    problem: Problem, simulations: Simulation, params: dict, statistics: dict, step: Array, clips: Clips
+):
+    """Return what `losses_and_gradient` gives for the rollouts of a device; the gradient has a leading axis of 1."""
+    scene, config = problem.scene, problem.config
 
-    On a CPU one after the other: side by side the searches for contact are slower, and it takes N times the memory.
+    def loss(params, simulation):
+        character = dressed(scene, simulation.betas, simulation.material, config)
+        animate = problem.animator({"params": params, "statistics": statistics}, scene, character, config)
+        return rollout.training_rollout(
+            animate, scene, character, simulation.cloth, clips, simulation.frame, simulation.fresh,
+            problem.frames, config, weighing(config.loss, step),
+        )  # fmt: skip
+
+    outputs, gradient = losses_and_gradient(loss, params, simulations)
+    return outputs, jax.tree.map(lambda x: x[None], gradient)
+
+
+def reset_mask(cloth: ClothState, losses: Array, stage: Stage1Config) -> Array:
+    """Return which simulations [B] are lost: too far away, of too large a loss, or not finite in either."""
+    lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < MAX_DISTANCE)
+    return lost | ~(losses < (jnp.inf if stage.lost is None else stage.lost))
+
+
+def advance(simulations: Simulation, cloth: ClothState, lost: Array, clips: Clips, frames: int) -> Simulation:
+    """Return the simulations [B] after a rollout; those that are lost go to the end of the clips, to begin anew."""
+    advanced = jnp.where(simulations.fresh, frames - 1, frames)
+    frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advanced)
+    cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
+    return Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
+
+
+def observe(state: TrainingState, seen: Features, skipped: Array) -> dict:
+    """Return the statistics after a step's features; unchanged if the step was skipped or they are frozen."""
+    return jax.lax.cond(
+        skipped | (state.step >= NORMALIZER_STEPS),
+        lambda statistics, _: statistics,
+        phi.observe,
+        state.statistics,
+        seen,
+    )
+
+
+def losses_and_gradient(loss: Callable, params: dict, batch):
+    """Compute the losses [N] of a batch with all else that `loss` returns, and the gradient of their mean.
+
+    On a CPU the elements are taken one after the other: together, contact searches are slower and need N times the
+    memory.
     """
     single = jax.value_and_grad(loss, has_aux=True)
     count = len(jax.tree.leaves(batch)[0])
     if count == 1:
-        found, gradient = single(params, jax.tree.map(lambda x: x[0], batch))
-        return jax.tree.map(lambda x: x[None], found), gradient
+        outputs, gradient = single(params, jax.tree.map(lambda x: x[0], batch))
+        return jax.tree.map(lambda x: x[None], outputs), gradient
 
     if jax.default_backend() != "cpu":
 
@@ -300,15 +325,15 @@ def losses_and_gradient(loss: Callable, params: dict, batch):
             losses, rest = jax.vmap(lambda one: loss(params, one))(batch)
             return jnp.mean(losses), (losses, rest)
 
-        (_, found), gradient = jax.value_and_grad(mean, has_aux=True)(params)
-        return found, gradient
+        (_, outputs), gradient = jax.value_and_grad(mean, has_aux=True)(params)
+        return outputs, gradient
 
     def add(total, one):
-        found, gradient = single(params, one)
-        return jax.tree.map(jnp.add, total, gradient), found
+        outputs, gradient = single(params, one)
+        return jax.tree.map(jnp.add, total, gradient), outputs
 
-    total, found = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), batch)
-    return found, jax.tree.map(lambda x: x / count, total)
+    total, outputs = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), batch)
+    return outputs, jax.tree.map(lambda x: x / count, total)
 
 
 def _where(condition: Array, new: Array, old: Array) -> Array:

@@ -14,15 +14,14 @@ from jax.sharding import Mesh
 from clothjax.body import motion_clips, skinning
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config, ModelConfig
-from clothjax.networks import animators, decoder, normalisation, psi
+from clothjax.networks import animators, decoder, mlp, normalisation, psi
 from clothjax.networks.normalisation import Normalizers
 from clothjax.simulation import rollout
 from clothjax.simulation.scene import Scene
 from clothjax.training import devices, loop, pool, sampling
-from clothjax.training.loop import Weights
 from clothjax.types import Array, Pose
 
-ORDINARY = 10_000  # random frames that tell which pose inputs are ordinary
+ORDINARY_FRAMES = 10_000  # random frames that show which pose inputs are ordinary
 
 
 class Teacher(NamedTuple):
@@ -34,7 +33,7 @@ class Teacher(NamedTuple):
 
 
 class TrainingState(NamedTuple):
-    """All that stage 2 is at a step."""
+    """State of stage 2 at a step; resuming from it is exact."""
 
     step: Array  # int32
     key: Array
@@ -43,14 +42,16 @@ class TrainingState(NamedTuple):
     optimizer: optax.OptState
     normalizers: Normalizers
     metric: Array  # [K, K] the mean squared vertex error of blend-weight errors, over the vertices' variance
-    garment: dict  # the frozen decoder and blend shapes: with them, a checkpoint is a whole Psi
+    garment: dict  # the frozen decoder and blend shapes; with them, a checkpoint is a complete Psi
 
 
-def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
-    """A function of a key, Phi (`params` and `statistics`) and clips: one rollout on a random clip, body and material.
+def make_rollout(scene: Scene, input_joints: np.ndarray, config: Config) -> Callable:
+    """Return a function that rolls Phi out on a random clip, body and material.
+
+    Its arguments are a key, Phi (`params` and `statistics`) and clips.
 
     Args:
-        kept: joints that are inputs.
+        input_joints: indices of the joints that are inputs.
     """
     stage = config.stage2
 
@@ -62,7 +63,7 @@ def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
         latents = rollout.play(animator, scene, character, poses, config).codes
 
         def inputs(poses: Pose):
-            return psi.window_inputs(poses, character.joints, scene.body.parents, kept, config.fps)
+            return psi.window_inputs(poses, character.joints, scene.body.parents, input_joints, config.fps)
 
         constants = psi.constant_inputs(simulation.betas, simulation.material, config.material)
         first = jnp.zeros_like(latents[:1])
@@ -71,9 +72,9 @@ def make_rollout(scene: Scene, kept: np.ndarray, config: Config) -> Callable:
     return sequence
 
 
-def blank(model: dict, scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> Teacher:
-    """A rollout of NaN: what is needed of a teacher to read a training that is finished, and nothing to train on."""
-    shapes = jax.eval_shape(make_rollout(scene, kept, config), jax.random.key(0), model, clips)
+def blank(model: dict, scene: Scene, clips: Clips, input_joints: np.ndarray, config: Config) -> Teacher:
+    """Return one rollout of NaN: enough of a teacher to read a finished training, and nothing to train on."""
+    shapes = jax.eval_shape(make_rollout(scene, input_joints, config), jax.random.key(0), model, clips)
     return jax.tree.map(lambda part: np.full((1, *part.shape), np.nan, part.dtype), shapes)
 
 
@@ -81,22 +82,25 @@ def teach(
     model: dict,
     scene: Scene,
     clips: Clips,
-    kept: np.ndarray,
+    input_joints: np.ndarray,
     config: Config,
-    progress: Callable = lambda done: None,
+    progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ) -> tuple[Teacher, float]:
-    """Rolls Phi out on random clips, bodies and materials; also tells the seconds it took.
+    """Roll Phi out on random clips, bodies and materials; also return the seconds it took.
 
     Args:
         model: Phi's `params` and `statistics`.
-        kept: joints that are inputs.
+        input_joints: indices of the joints that are inputs.
         progress: called with the number of sequences done.
         device_mesh: each device rolls out a part of the sequences.
+
+    Raises:
+        ValueError: if no rollout stayed finite.
     """
     stage = config.stage2
     began = time.monotonic()
-    sequence = make_rollout(scene, kept, config)
+    sequence = make_rollout(scene, input_joints, config)
     teacher = sampling.sample(sequence, (model, clips), stage.sequences, stage.seed + 1, progress, device_mesh)
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
@@ -104,8 +108,8 @@ def teach(
     return Teacher(*(part[good] for part in teacher)), time.monotonic() - began
 
 
-def ordinary_poses(scene: Scene, clips: Clips, kept: np.ndarray, config: Config) -> np.ndarray:
-    """Inputs [n, P] of random frames and bodies of training, of which the teacher's few rollouts hold only a part."""
+def ordinary_poses(scene: Scene, clips: Clips, input_joints: np.ndarray, config: Config) -> np.ndarray:
+    """Draw inputs [n, P] of random frames and bodies of training; the teacher's few rollouts hold only a part."""
     clips = jax.tree.map(jnp.asarray, clips)
 
     def one(key):
@@ -114,16 +118,16 @@ def ordinary_poses(scene: Scene, clips: Clips, kept: np.ndarray, config: Config)
         betas = jax.random.uniform(keys[0], (scene.body.shapedirs.shape[-1],), minval=-limit, maxval=limit)
         poses = motion_clips.poses(clips, motion_clips.draw(clips, jax.random.uniform(keys[1])))
         joints = skinning.shaped_joints(scene.body, betas)
-        return psi.window_inputs(poses, joints, scene.body.parents, kept, config.fps)
+        return psi.window_inputs(poses, joints, scene.body.parents, input_joints, config.fps)
 
-    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(config.stage2.seed), ORDINARY)))
+    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(config.stage2.seed), ORDINARY_FRAMES)))
 
 
 def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray | None = None) -> TrainingState:
-    """The state before the first step, its normalizers measured on the teacher's rollouts and `ordinary`.
+    """Return the state before the first step; its normalizers are measured on the teacher's rollouts and `ordinary`.
 
     Args:
-        ordinary: more inputs [n, P], as of `ordinary_poses`.
+        ordinary: more inputs [n, P], such as those of `ordinary_poses`.
     """
     key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
     size = teacher.latents.shape[-1]
@@ -147,7 +151,7 @@ def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray |
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Adam behind a clipped norm, at a cosine-decayed rate."""
+    """Build Adam with a clipped norm and a cosine-decayed rate."""
     stage = config.stage2
     return optax.chain(
         optax.clip_by_global_norm(stage.clip),
@@ -155,8 +159,8 @@ def optimizer(config: Config) -> optax.GradientTransformation:
     )
 
 
-def vertex_metric(garment: dict, latents: np.ndarray, model: ModelConfig) -> Array:
-    """Matrix M [K, K] such that w^T M w is the mean squared displacement of vertices, as a share of its variance.
+def vertex_metric(garment: dict, latents: Array, model: ModelConfig) -> Array:
+    """Compute the matrix M [K, K]: w^T M w is the mean squared displacement of vertices, as a share of its variance.
 
     Args:
         latents: [N, L] codes over which the variance is taken.
@@ -169,8 +173,8 @@ def vertex_metric(garment: dict, latents: np.ndarray, model: ModelConfig) -> Arr
 
 
 def _weights(garment: dict, model: ModelConfig) -> Callable[[Array], Array]:
-    """A function from a code [L] to blend-shape weights [K]."""
-    return partial(decoder.of(garment, model).apply, {"params": garment}, method="blend_weights")
+    """Return the function from a code [L] to blend-shape weights [K]."""
+    return partial(mlp.apply, decoder.of(garment, model), garment, method="blend_weights")
 
 
 def rollout_loss(
@@ -182,26 +186,28 @@ def rollout_loss(
     key: Array,
     config: Config,
 ) -> Array:
-    """Mean squared error of one closed-loop rollout of the predictor `params`, as a share of the variance.
+    """Compute the mean squared error of one autoregressive rollout of the predictor, as a share of the variance.
 
-    The first Z is perturbed, so the predictor learns to come back: plain one-step regression diverges in closed loop.
+    The first code is perturbed, so the predictor learns to come back: after plain one-step regression, rollouts
+    diverge.
 
     Args:
+        params: of the predictor.
         state: for its normalizers, metric and decoder.
         latents: [H + 1, L] teacher codes; poses: [H, P]; constants: [C]; key: of the noise.
     """
     stage, normalizers = config.stage2, state.normalizers
     targets = jax.vmap(lambda z: normalisation.normalise(normalizers.latent, z))(latents)
     poses = jax.vmap(lambda x: normalisation.normalise(normalizers.pose, x))(poses)
-    of_code, predictor = _weights(state.garment, config.model), psi.Psi(stage)
+    weights_of_code, predictor = _weights(state.garment, config.model), psi.Psi(stage)
     noise = stage.noise * jax.random.normal(key, targets[0].shape)
 
     def weights(latent):
-        return of_code(normalisation.denormalise(normalizers.latent, latent))
+        return weights_of_code(normalisation.denormalise(normalizers.latent, latent))
 
     def body(latent, inputs):
         pose, target = inputs
-        predicted = predictor.apply({"params": params}, latent, pose, constants)
+        predicted = mlp.apply(predictor, params, latent, pose, constants)
         error = jnp.mean((predicted - target) ** 2)
         if stage.vertex_share > 0:
             apart = weights(predicted) - weights(target)
@@ -215,9 +221,9 @@ def rollout_loss(
 def make_update(
     teacher: Teacher, config: Config, steps: int, device_mesh: Mesh | None = None
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """A jitted function that takes `steps` training steps, and their metrics [steps]; it consumes its argument.
+    """Return a jitted function that takes `steps` training steps, and their metrics [steps].
 
-    A batch is spread over the devices.
+    It consumes its argument (buffers are donated). A batch is spread over the devices.
     """
     stage = config.stage2
     transform = optimizer(config)
@@ -238,17 +244,9 @@ def make_update(
         each = devices.shard(jax.vmap(one, (0, None, None, None)), device_mesh)
         return jnp.mean(each((which, begin, jax.random.split(keys[2], stage.batch)), params, state, teacher))
 
-    def one(teacher: Teacher, state: TrainingState, _):
+    def train_step(teacher: Teacher, state: TrainingState):
         key = jax.random.fold_in(state.key, state.step)
         value, gradient = jax.value_and_grad(loss)(state.params, state, teacher, key)
-        weights, metrics = loop.update_weights(
-            transform, Weights(state.params, state.average, state.optimizer), value, gradient, ema=0.99
-        )
-        return state._replace(step=state.step + 1, **weights._asdict()), metrics
+        return loop.apply_gradient(transform, state, value, gradient, ema=0.99)
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
-    def update(state, teacher):
-        return jax.lax.scan(partial(one, teacher), state, None, length=steps)
-
-    teacher = devices.replicate(teacher, device_mesh)
-    return lambda state: update(state, teacher)
+    return loop.scan_steps(train_step, teacher, steps, device_mesh)

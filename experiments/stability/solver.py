@@ -85,9 +85,9 @@ def _run(experiment: Experiment, config: Config, character: Character, poses: Po
     finite = bool(np.isfinite(trajectory).all())
     strain = metrics.edge_strain(experiment.scene, character, last)["edge_strain_max"] if finite else np.inf
     inside = (
-        metrics.penetrations(
-            experiment.scene, experiment.body, character.betas, last, _next(poses), [0], experiment.names
-        )["penetration_percent"]
+        metrics.penetrations(experiment.body, character.betas, last, _next(poses), [0], experiment.names)[
+            "penetration_percent"
+        ]
         if finite
         else np.inf
     )

@@ -34,7 +34,7 @@ def built(request):
     reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
     kept = psi.input_joints(whole.names, whole.config.stage2)
     shapes = laplacian_shapes.laplacian(whole.scene, whole.config)
-    return whole, reel, kept, stage1.init_peer(whole.scene, reel, kept, shapes, whole.config)
+    return whole, reel, kept, stage1.init_baseline(whole.scene, reel, kept, shapes, whole.config)
 
 
 @pytest.fixture(scope="module")

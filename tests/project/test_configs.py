@@ -27,7 +27,7 @@ def test_every_configuration_takes_two_steps(path):
     reel, _ = assembly.training_clips(whole)
     if config.peer.network:
         kept = psi.input_joints(whole.names, config.stage2)
-        state = stage1.init_peer(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
+        state = stage1.init_baseline(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
         update = stage1.make_curriculum(whole.scene, reel, config, 2, animator=animators.baseline_animator(kept))
     else:
         state = stage1.init(whole.scene, reel, config)

@@ -69,5 +69,5 @@ def test_loops_that_all_blow_up_are_reported():
     whole = assembly.assemble(config)
     reel, _ = assembly.training_clips(whole)
     state = stage1.init(whole.scene, reel, config)
-    with pytest.raises(ValueError, match="no closed loop of an untrained Phi stayed finite"):
+    with pytest.raises(ValueError, match="no rollout of an untrained Phi stayed finite"):
         preconditioner.measure({"params": state.params, "statistics": state.statistics}, whole.scene, reel, config)

@@ -67,7 +67,7 @@ def test_what_blew_up_is_left_out(skirt, monkeypatch):
     found[0, 0, 0, 0] = 9.0
     with pytest.raises(ValueError, match="look at the garment on the body"):
         principal_shapes.simulate(whole.scene, reel, whole.config)
-    monkeypatch.setattr(principal_shapes, "LARGEST", 1000)
+    monkeypatch.setattr(principal_shapes, "MAX_VERTICES", 1000)
     with pytest.raises(ValueError, match=r"shapes\.sequences: 0"):
         principal_shapes.simulate(whole.scene, reel, whole.config)
 

@@ -83,7 +83,7 @@ def test_a_simulation_whose_energy_tells_that_it_is_lost_is_begun_anew(toy, upda
     after, metrics = update(state._replace(pool=torn))
     assert metrics["lost"][0] and float(metrics["loss"][0]) > highest and np.isfinite(metrics["loss"][0])
     again = after._replace(step=jnp.int32(0))  # its next turn
-    _, begun = stage1.turn(again, whole.scene, jax.tree.map(jnp.asarray, reel), 1, whole.config)
+    _, begun = stage1.next_batch(again, whole.scene, jax.tree.map(jnp.asarray, reel), 1, whole.config)
     assert np.abs(begun.betas[0] - betas).max() > 0
 
 
