@@ -28,7 +28,7 @@ class Parser(argparse.ArgumentParser):
         settings: whether settings of a configuration may follow, as `--stage1.steps 20`.
     """
 
-    def __init__(self, program: str, about: str, settings: bool = False, **options):
+    def __init__(self, program: str, about: str | None, settings: bool = False, **options):
         self.settings, self.takes_model = settings, False
         form = argparse.RawDescriptionHelpFormatter
         super().__init__(
@@ -98,7 +98,8 @@ def arguments(kind: type[Arguments], program: str, about: str, argv: Sequence[st
     import tyro
 
     argv = sys.argv[1:] if argv is None else argv
-    refuse_old_spellings(argv, [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(kind)])
+    fields = dataclasses.fields(kind)  # pyright: ignore[reportArgumentType]  # a TypeVar cannot say dataclass
+    refuse_old_spellings(argv, [f"--{field.name.replace('_', '-')}" for field in fields])
     if {"-h", "--help"} & set(argv):
         print(about)  # as it is: tyro would fold its lines
     return tyro.cli(kind, args=list(argv), prog=f"python -m {program}")

@@ -76,14 +76,14 @@ def draw(clips: Clips, uniform: Array) -> Array:
     return jnp.minimum(jnp.searchsorted(clips.chance, uniform, side="right"), last).astype(jnp.int32)
 
 
-def poses(clips: Clips, frame: Array) -> Pose:
+def poses(clips: Clips, frame: Array | int) -> Pose:
     """Previous, current and following pose of a frame (leading axis 3); translations relative to the current one."""
     before = clips.advance[frame - 1]
     translation = jnp.stack([-before, jnp.zeros_like(before), clips.advance[frame]])
     return Pose(clips.rotations[frame + jnp.arange(-1, 2)], translation)
 
 
-def there_and_back(clips: Clips, frame: Array, count: int) -> Pose:
+def there_and_back(clips: Clips, frame: Array | int, count: int) -> Pose:
     """Return windows [count, 3, ...] like those of `poses`, from a frame on; a clip that ends sooner turns back."""
     # from the frame before the first that has a window to the one after the last
     first, period = frame - clips.passed[frame], clips.passed[frame] + clips.remaining[frame]

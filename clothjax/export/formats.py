@@ -44,7 +44,7 @@ def _write_litert(model: Model, path: Path, options: Options, about: dict) -> No
     litert.to_litert(model, path, int8=options.int8, about=about)
 
 
-def _run_c(path: Path, model: Model, motion: Motion, options: Options) -> np.ndarray | None:
+def _run_c(path: Path, _model: Model, motion: Motion, _options: Options) -> np.ndarray | None:
     if native.compiler() is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
@@ -75,7 +75,9 @@ FORMATS = {
     "safetensors": Format(
         "safetensors",
         lambda model, path, *_: safetensors.to_safetensors(model, path),
-        lambda path, model, motion, _: np.asarray(inference.animate(safetensors.from_safetensors(path), motion)[0]),
+        lambda path, _model, motion, _options: np.asarray(
+            inference.animate(safetensors.from_safetensors(path), motion)[0]
+        ),
         described=False,
     ),
 }  # by the name that a user gives

@@ -46,7 +46,7 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
         return dict(zip(frame.RESULTS, traced(*arguments), strict=True))
 
     owner = tensorflow.Module()  # without one a file has no signature
-    owner.frame = named
+    owner.frame = named  # pyright: ignore[reportAttributeAccessIssue]  # how TensorFlow keeps a function
     converter = tensorflow.lite.TFLiteConverter.from_concrete_functions([named.get_concrete_function()], owner)
     if int8:
         converter.optimizations = [tensorflow.lite.Optimize.DEFAULT]
@@ -77,14 +77,14 @@ def run_litert(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
         ImportError: if LiteRT is not installed.
     """
     try:
-        from ai_edge_litert.interpreter import Interpreter
+        from ai_edge_litert.interpreter import Interpreter  # pyright: ignore[reportMissingImports]  # an optional package
     except ImportError as error:
         raise ImportError("LiteRT is not installed: pip install ai-edge-litert") from error
     run = Interpreter(model_path=str(path), num_threads=1).get_signature_runner()
     rotations, translation = (np.asarray(x, np.float32) for x in (motion.rotations, motion.translation))
     state = inference.initial_state(model, Pose(rotations[0], translation[0]))[:-1]
     vertices = []
-    for pose in zip(rotations, translation):
+    for pose in zip(rotations, translation, strict=True):
         found = run(**dict(zip(frame.ARGUMENTS, (*map(np.asarray, state), *pose), strict=True)))
         state = [found[name] for name in frame.RESULTS[: len(state)]]
         vertices.append(found["vertices"])

@@ -49,7 +49,7 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     """All of a file in its order."""
     network, wearer = model.network, model.wearer
     code = len(network.first)
-    wide = len(network.decoder[0].kernel)
+    wide = network.decoder_width
     head = (
         MAGIC, VERSION, len(model.parents), len(model.kept), len(model.moving), wearer.template.shape[1], code,
         len(network.hidden), len(network.decoder), len(network.read.bias) > wide, model.config.model.blendshape_relu,
@@ -158,7 +158,8 @@ class Psi:
         why = ctypes.c_char_p()
         self._model = ctypes.c_void_p(self._c.psi_load(str(path).encode(), ctypes.byref(why)))
         if not self._model:
-            raise ValueError(f"{path}: {why.value.decode()}")
+            reason = (why.value or b"unreadable").decode()
+            raise ValueError(f"{path}: {reason}")
         self.joints = self._c.psi_joints(self._model)
         self.vertices = np.zeros((self._c.psi_vertices(self._model), 3), np.float32)
         pose = self._pose(rotations, translation)
@@ -198,7 +199,7 @@ def run_c(library: str | Path, path: str | Path, motion: Motion) -> np.ndarray:
     """Vertices [T, V, 3] m of a file over a motion."""
     psi = Psi(library, path, motion.rotations[0], motion.translation[0])
     vertices = []
-    for pose in zip(motion.rotations, motion.translation):
+    for pose in zip(motion.rotations, motion.translation, strict=True):
         psi.step(*pose)
         vertices.append(psi.vertices.copy())
     return np.stack(vertices)

@@ -74,10 +74,10 @@ def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     batch = batch if isinstance(batch, int) else 1
     state = first_state(model, Pose(rotations[0, 0], translation[0, 0]), batch)
     vertices = []
-    for pose in zip(rotations, translation):
+    for pose in zip(rotations, translation, strict=True):
         pose = [np.repeat(x, batch, axis=0) for x in pose]
         *state, shown = run.run([*FOLLOWING[:-1], "vertices"], dict(zip(INPUTS, (*state, *pose), strict=True)))
-        vertices.append(shown[0])
+        vertices.append(np.asarray(shown)[0])
     return np.stack(vertices)
 
 
@@ -205,7 +205,7 @@ def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[s
     bias = np.asarray(bias) + np.asarray(model.wearer.bias)
     limits = [np.maximum(-np.asarray(b.low), np.asarray(b.high)) for b in (network.pose_bounds, network.code_bounds)]
     limits[0] = limits[0][order]
-    if kernel is None:
+    if network.folded:
         x = g("Add", g.even(inputs, limits[0], Layer(first, bias)), g.slice("latent", 1, 0, len(bias)))
     else:
         both = g("Concat", inputs, "latent", axis=1)
@@ -227,8 +227,8 @@ def canonical(g: Graph, latent: str, model: Model) -> str:
 def shape_weights(g: Graph, latent: str, model: Model) -> str:
     """The weights [N, K] of the blend shapes."""
     network = model.network
-    size, wide = len(network.read.bias), len(network.decoder[0].kernel)
-    if network.read.kernel is None:
+    size, wide = len(network.read.bias), network.decoder_width
+    if network.folded:
         whole = len(network.first)
         read = g("Add", g.slice(latent, 1, whole - size, whole), network.read.bias)
     else:

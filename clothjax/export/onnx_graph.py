@@ -32,14 +32,14 @@ class Graph:
             raise ImportError("ONNX export needs onnx: pip install clothjax[export]") from error
         self.onnx, self.nodes, self.constants, self.int8 = onnx, [], [], int8
 
-    def __call__(self, operator: str, *inputs: str | Array, name: str | None = None, **attributes) -> str:
+    def __call__(self, operator: str, *inputs: str | Array | np.generic, name: str | None = None, **attributes) -> str:
         """Adds a node; arrays among its inputs become constants. Returns the name of its output."""
-        inputs = [x if isinstance(x, str) else self.constant(x) for x in inputs]
+        names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
         name = name or f"{operator.lower()}_{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(operator, inputs, [name], name=name, **attributes))
+        self.nodes.append(self.onnx.helper.make_node(operator, names, [name], name=name, **attributes))
         return name
 
-    def constant(self, array: Array) -> str:
+    def constant(self, array: Array | np.generic) -> str:
         array = np.asarray(array)
         if array.dtype == np.float64:
             array = array.astype(np.float32)
@@ -80,9 +80,9 @@ class Graph:
         left = self("Sub", x, held)
         return self("Add", self("Add", self.product(held, kernel), self.product(left, kernel)), layer.bias)
 
-    def even(self, x: str, limits: Array, layer: Layer) -> str:
-        """`layer` of inputs within +-`limits`, both scaled by `folding.evening` where matrices have eight bits."""
-        if not self.int8:
+    def even(self, x: str, limits: Array | None, layer: Layer) -> str:
+        """`layer` of inputs within +-`limits`, both scaled by `specialise.evening` where matrices have eight bits."""
+        if limits is None or not self.int8:
             return self.layer(x, layer)
         scale = evening(limits, layer.kernel)
         return self.layer(self("Mul", x, 1.0 / scale), Layer(np.asarray(layer.kernel) * scale[:, None], layer.bias))

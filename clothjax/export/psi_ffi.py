@@ -79,4 +79,4 @@ def step(packed: Packed, state: State, pose: Pose, vertices: bool = True) -> tup
              jax.ShapeDtypeStruct(seen, jnp.float32)]  # fmt: skip
     call = jax.ffi.ffi_call(TARGET, kinds, vmap_method="sequential")
     carried, ok, found = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose))
-    return State(*restored(carried), ok), found if vertices else None
+    return State(*restored(carried), ok=ok), found if vertices else None

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 
 from clothjax.config import Config
 from clothjax.files import configuration, storage
-from clothjax.runtime.inference import Bounds, Layer, Model, Network, Wearer
+from clothjax.runtime.inference import NO_KERNEL, Bounds, Layer, Model, Network, Wearer
 
 FORMAT = 1  # of the file; readers refuse a newer one
 STATIC = ("names", "parents", "kept", "moving")
@@ -43,13 +44,13 @@ def from_safetensors(path: str | Path) -> Model:
     try:
         with library.safe_open(str(path), framework="numpy") as file:
             about = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
-            arrays = {name: jnp.asarray(file.get_tensor(name)) for name in file.keys()}
+            arrays: dict[str, Any] = {name: jnp.asarray(file.get_tensor(name)) for name in list(file.keys())}
         storage.refuse_newer(path, about.get("format", 1), FORMAT)
         config = configuration.from_dict(Config, about["config"], str(path))
         static = {name: tuple(about[name]) for name in STATIC}
 
         def layer(name: str) -> Layer:
-            return Layer(arrays.get(f"{name}.kernel"), arrays[f"{name}.bias"])
+            return Layer(arrays.get(f"{name}.kernel", NO_KERNEL), arrays[f"{name}.bias"])
 
         def layers(name: str) -> tuple[Layer, ...]:
             count = sum(key.startswith(f"network.{name}.") and key.endswith(".bias") for key in arrays)

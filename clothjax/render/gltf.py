@@ -43,7 +43,8 @@ def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-
             }
             for target in targets
         ]
-        primitive = gltf.Primitive(attributes=attributes, indices=corners, material=index, targets=morphs)
+        primitive = gltf.Primitive(attributes=attributes, indices=corners, material=index)
+        primitive.targets = morphs  # pyright: ignore[reportAttributeAccessIssue]  # dictionaries are written as they are
         meshes.append(gltf.Mesh(name=part.name, primitives=[primitive], weights=[0.0] * len(targets)))
         nodes.append(gltf.Node(name=part.name, mesh=index))
         base = gltf.PbrMetallicRoughness(baseColorFactor=[*part.colour, 1.0], metallicFactor=0.0, roughnessFactor=0.9)

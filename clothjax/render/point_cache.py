@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from trimesh.exchange.obj import export_obj
 
 from clothjax.render.performance import Part, Performance
 
@@ -40,4 +41,7 @@ def _rest(path: Path, performance: Performance) -> None:
 def _mesh(path: Path, performance: Performance, frame: int, parts: tuple[Part, ...]) -> None:
     root = np.asarray(performance.root)[frame]
     meshes = {part.name: trimesh.Trimesh(part.vertices[frame] + root, part.faces, process=False) for part in parts}
-    path.write_text(trimesh.exchange.obj.export_obj(trimesh.Scene(meshes), include_normals=False, header=""))
+    scene = trimesh.Scene()
+    for name, mesh in meshes.items():
+        scene.add_geometry(mesh, geom_name=name)
+    path.write_text(export_obj(scene, include_normals=False, header=""))

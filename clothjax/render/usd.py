@@ -1,3 +1,5 @@
+# OpenUSD has no stubs:
+# pyright: reportAttributeAccessIssue=false
 """USD: an animated garment on its body, as meshes with a time sample for every frame."""
 
 from pathlib import Path

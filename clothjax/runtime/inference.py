@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.files import storage
+from clothjax.material import configured_material
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import Normalizers
 from clothjax.runtime import trained
@@ -31,10 +32,13 @@ FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
+NO_KERNEL: Any = None  # of the readers of a folded code
+
+
 class Layer(NamedTuple):
     """A dense layer; without a kernel, what it would make of its input comes with that."""
 
-    kernel: Array | None  # [inputs, outputs]
+    kernel: Array  # [inputs, outputs]; None where the code is folded (`Network.folded`)
     bias: Array  # [outputs]
 
 
@@ -61,6 +65,16 @@ class Network(NamedTuple):
     mix: Layer | None  # [K, K'] from its weights to those of fewer shapes
     shapes: Array  # [K, 3 V] m, or [K', 3 V], the x of all vertices first; zero where they are pinned
     weights: Array  # [J', V] skinning weights of the joints `Model.moving`
+
+    @property
+    def folded(self) -> bool:
+        """True if the code is carried as what its two readers make of it: `code` and `read` have no kernels."""
+        return self.code.kernel is None
+
+    @property
+    def decoder_width(self) -> int:
+        """Outputs D of `read` that the decoder's other layers take; the rest goes to the weights directly."""
+        return len(self.decoder[0].kernel)
 
 
 class Wearer(NamedTuple):
@@ -120,9 +134,7 @@ def build(
     betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
     if betas.shape != (body.shapedirs.shape[-1],):
         raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
-    cloth = config.material
-    if material is None:
-        material = Material(cloth.density, cloth.mu, cloth.lam, cloth.bending)
+    material = configured_material(config) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
     network, wearer = _arrays(garment, body, garment_params, predictor, normalizers, betas, material, config)
     return Model(
@@ -202,7 +214,9 @@ def crowd(models: Sequence[Model]) -> Model:
         raise ValueError("a crowd needs at least one model")
     first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=models[0].wearer)) for model in models)
     for number, (leaves, structure) in enumerate(others, 1):
-        same = structure == first[1] and all(a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0]))
+        same = structure == first[1] and all(
+            a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0], strict=True)
+        )
         if not same:
             raise ValueError(
                 f"models[{number}] differs from models[0] in more than its wearer: a crowd is of one garment, and of "
@@ -248,7 +262,8 @@ def initial_state(model: Model, pose: Pose) -> State:
     still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
     pose, ok = _sound_or(pose, still)
     _, positions = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
-    return State(model.network.first, *(jnp.stack([x, x]) for x in (pose.rotations, positions, pose.translation)), ok)
+    rotations, positions, translation = (jnp.stack([x, x]) for x in (pose.rotations, positions, pose.translation))
+    return State(model.network.first, rotations, positions, translation, ok)
 
 
 def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
@@ -291,7 +306,7 @@ def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple
 def predict(network: Network, latent: Array, inputs: Array, bias: Array, config: Config) -> Array:
     """The next code [C] from the current one, pose inputs [P] and the wearer's part [H] of the first layer."""
     kernel, common = network.code
-    x = inputs @ network.pose + (latent[: len(bias)] if kernel is None else latent @ kernel) + common + bias
+    x = inputs @ network.pose + (latent[: len(bias)] if network.folded else latent @ kernel) + common + bias
     for kernel, bias in network.hidden:
         x = jax.nn.relu(x) @ kernel + bias
     return (1.0 - config.stage2.latent_decay) * latent + x
@@ -300,8 +315,8 @@ def predict(network: Network, latent: Array, inputs: Array, bias: Array, config:
 def blend_weights(network: Network, latent: Array, config: Config) -> Array:
     """Weights of `Network.shapes` of a code [C]."""
     kernel, bias = network.read
-    read = bias + (latent[-len(bias) :] if kernel is None else latent @ kernel)
-    wide = len(network.decoder[0].kernel)
+    read = bias + (latent[-len(bias) :] if network.folded else latent @ kernel)
+    wide = network.decoder_width
     x, beside = read[:wide], read[wide:]
     for kernel, bias in network.decoder:
         x = jax.nn.relu(x) @ kernel + bias

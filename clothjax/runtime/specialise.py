@@ -12,13 +12,13 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.files import storage
 from clothjax.geometry import proximity
-from clothjax.runtime.inference import Bounds, Layer, Model, Network, blend_weights, initial_state, step
+from clothjax.runtime.inference import NO_KERNEL, Bounds, Layer, Model, Network, blend_weights, initial_state, step
 from clothjax.types import Array, Garment, Motion, Pose
 
-WORTH = 0.75  # of the weights of the layers around the code, that folding it away must leave at the most
-CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # that tell which displacements occur
-UNSEEN = 1e-3  # of the mean variance of blend-shape weights: that of those that do not vary there
-SAMPLES = 2048  # codes that do, where these do not fit
+FOLD_RATIO = 0.75  # of the weights of the layers around the code, that folding it away must leave at the most
+CALIBRATION_CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # that tell which displacements occur
+UNSEEN_VARIANCE = 1e-3  # of the mean variance of blend-shape weights: that of those that do not vary there
+CALIBRATION_CODES = 2048  # codes that do, where these do not fit
 
 
 def specialise(model: Model, *, blendshapes: int | None = None, max_influences: int | None = None) -> Model:
@@ -39,7 +39,7 @@ def specialise(model: Model, *, blendshapes: int | None = None, max_influences: 
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     if blendshapes is not None and blendshapes < len(model.network.shapes):
-        if model.network.code.kernel is None or model.network.mix is not None:
+        if model.network.folded or model.network.mix is not None:
             raise ValueError("this model is specialised already: give `blendshapes` with the first call")
         model = _fewer_shapes(model, blendshapes)
     if max_influences is not None:
@@ -53,21 +53,21 @@ def without_code(model: Model) -> Model:
     The code is given by a linear layer and read by two: the predictor's first in the next frame, and the decoder's.
     """
     network = model.network
-    if network.code.kernel is None:
+    if network.folded:
         return model
     readers = jnp.concatenate([network.code.kernel, network.read.kernel], axis=1)
     *hidden, last = network.hidden
     folded = Layer(_product(last.kernel, readers), _product(last.bias, readers))
-    if folded.kernel.size > WORTH * (last.kernel.size + readers.size):
+    if folded.kernel.size > FOLD_RATIO * (last.kernel.size + readers.size):
         return model
     low, high, slack = network.code_bounds
     middle, radius = _product(0.5 * (low + high), readers), _product(0.5 * (high - low), jnp.abs(readers))
     network = network._replace(
-        code=Layer(None, network.code.bias),
+        code=Layer(NO_KERNEL, network.code.bias),
         hidden=(*hidden, folded),
         code_bounds=Bounds(middle - radius, middle + radius, _product(slack, jnp.abs(readers))),
         first=_product(network.first, readers),
-        read=Layer(None, network.read.bias),
+        read=Layer(NO_KERNEL, network.read.bias),
     )
     return dataclasses.replace(model, network=network)
 
@@ -79,14 +79,14 @@ def evened(model: Model) -> Model:
     largest = np.abs(ordinary_weights(model)).max(axis=0)
     of_shapes = evening(largest, network.shapes)
     *decoder, last = network.decoder
-    wide, mix, read = len(network.decoder[0].kernel), network.mix, network.read
+    wide, mix, read = network.decoder_width, network.mix, network.read
     if mix is not None:
         mix = Layer(mix.kernel / of_shapes[None], mix.bias / of_shapes)
     else:
         last = Layer(last.kernel / of_shapes[None], last.bias / of_shapes)
         beside = np.concatenate([np.ones(wide), of_shapes])[: len(read.bias)]
-        read = Layer(None if read.kernel is None else read.kernel / beside[None], read.bias / beside)
-    if network.code.kernel is None:  # the code is what the readers make of it: here of `read`, at its end
+        read = Layer(read.kernel if network.folded else read.kernel / beside[None], read.bias / beside)
+    if network.folded:  # the code is what the readers make of it: here of `read`, at its end
         scale = np.ones(len(network.first), np.float32)
         if mix is None:
             scale[-len(read.bias) :] = beside
@@ -171,10 +171,10 @@ def ordinary_weights(model: Model) -> np.ndarray:
     """Blend-shape weights [n, K] of closed loops over embedded clips; of random codes, for a body they do not fit."""
     limits = model.network.code_bounds
     try:
-        clips = [storage.load_motion(name, model.names) for name in CLIPS]
+        clips = [storage.load_motion(name, model.names) for name in CALIBRATION_CLIPS]
         codes = jnp.concatenate([_codes(model, clip) for clip in clips])
     except ValueError:
-        codes = jax.random.normal(jax.random.key(0), (SAMPLES, len(limits.low)))
+        codes = jax.random.normal(jax.random.key(0), (CALIBRATION_CODES, len(limits.low)))
         codes = jnp.clip(codes, limits.low[None], limits.high[None])
     return np.asarray(jax.vmap(lambda code: blend_weights(model.network, code, model.config))(codes))
 
@@ -205,10 +205,7 @@ def _fewer_shapes(model: Model, count: int) -> Model:
     mix, shapes, moved = principal_rows(ordinary_weights(model), np.asarray(model.network.shapes), count)
     network = model.network._replace(shapes=jnp.asarray(shapes))
     template = model.wearer.template + jnp.asarray(moved).reshape(3, -1)
-    if model.config.model.blendshape_relu:
-        network = network._replace(mix=mix)
-    else:
-        network = _mixed(network, mix)
+    network = network._replace(mix=mix) if model.config.model.blendshape_relu else _mixed(network, mix)
     return dataclasses.replace(model, network=network, wearer=model.wearer._replace(template=template))
 
 
@@ -217,7 +214,7 @@ def principal_rows(weights: np.ndarray, shapes: np.ndarray, count: int) -> tuple
     their weights, themselves [count, N], and what is to be added [N]."""
     weights = weights.astype(np.float64)
     mean, spread = weights.mean(axis=0), np.cov(weights.T)
-    root = np.linalg.cholesky(spread + UNSEEN * np.trace(spread) / len(mean) * np.eye(len(mean)))
+    root = np.linalg.cholesky(spread + UNSEEN_VARIANCE * np.trace(spread) / len(mean) * np.eye(len(mean)))
     # weights are mean + u root^T with isotropic u: the rows that serve u best are principal in root^T shapes
     unmixed = root.T @ shapes.astype(np.float64)
     chosen = np.linalg.eigh(unmixed @ unmixed.T)[1][:, -count:]
@@ -233,7 +230,7 @@ def principal_rows(weights: np.ndarray, shapes: np.ndarray, count: int) -> tuple
 def _mixed(network: Network, mix: Layer) -> Network:
     """The decoder with a linear layer behind it folded in."""
     *others, last = network.decoder
-    wide = len(network.decoder[0].kernel)
+    wide = network.decoder_width
 
     def beside(rows: Array) -> Array:
         return jnp.concatenate([rows[..., :wide], _product(rows[..., wide:], mix.kernel)], axis=-1)

@@ -168,7 +168,7 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         "predictor": predictor,
         "normalizers": {name: each._asdict() for name, each in normalizers._asdict().items()},
     }
-    arrays = {"format": np.int32(FORMAT)}
+    arrays: dict[str, Any] = {"format": np.int32(FORMAT)}
     for name, leaf in checkpoint.named(parts).items():
         leaf = np.asarray(leaf)
         if name in HALVED:

@@ -50,7 +50,7 @@ DISTURBANCE = 1e-6  # m
 AT_REST = 2  # substeps of `hang`: few, for their damping
 
 
-def simulate(engines: dict, frames: int, substeps: int, report=lambda frame: None) -> tuple[dict, dict]:
+def simulate(engines: dict, frames: int, substeps: int, report=lambda _frame: None) -> tuple[dict, dict]:
     """Positions [T, V, 3] m of every engine, which take turns frame by frame, and median seconds of a frame."""
     tracks, seconds = {name: [] for name in engines}, {name: [] for name in engines}
     for frame in range(frames):

@@ -515,7 +515,7 @@ def test_shape_space_is_the_principal_components_of_the_shapes():
 
 
 def test_target_weights():
-    phenotype = {name: 0.5 for name in anny.LADDERS} | {"african": 0.2, "asian": 0.3, "caucasian": 0.5}
+    phenotype = dict.fromkeys(anny.LADDERS, 0.5) | {"african": 0.2, "asian": 0.3, "caucasian": 0.5}
     phenotype |= {"gender": 0.25, "muscle": 0.75}
     words = [("male", "young"), ("female", "averagemuscle"), ("maxmuscle", "asian"), ("minmuscle",)]
     np.testing.assert_allclose(anny.coefficients(words, phenotype), [0.75, 0.125, 0.15, 0])

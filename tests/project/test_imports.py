@@ -18,10 +18,27 @@ HOST = {  # NumPy only
     "training.run_folder",
 }
 # from the ground up: a folder may import those before it
-FLOORS = (
-    "types config progress material geometry body files physics simulation networks training runtime export render "
-    "evaluation cli commands doctor __main__"
-).split()
+FLOORS = [
+    "types",
+    "config",
+    "progress",
+    "material",
+    "geometry",
+    "body",
+    "files",
+    "physics",
+    "simulation",
+    "networks",
+    "training",
+    "runtime",
+    "export",
+    "render",
+    "evaluation",
+    "cli",
+    "commands",
+    "doctor",
+    "__main__",
+]
 # what may never reach what, by any chain of imports
 NEVER = {
     "clothjax.runtime": {"training", "evaluation", "simulation", "physics", "export", "render", "commands", "cli"},
