@@ -179,7 +179,7 @@ def test_garment_that_does_not_fit_its_body(tmp_path, change, word):
         (_spin(fps=0.0), "abc", "fps"),
         (_spin(fps=np.nan), "abc", "fps"),
         (_spin()._replace(translation=np.full((5, 3), 95.0)), "abc", "centimetres"),
-        (_spin(), "abd", r"lacks \['c'\], has \['d'\]"),
+        (_spin(), "abd", r"lacks \['c'\] and also has \['d'\]"),
         (_spin(), "bac", "another order"),
     ],
 )
