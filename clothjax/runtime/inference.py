@@ -351,12 +351,13 @@ def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
 @jax.jit
 def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
     """`step` for every character of a `crowd`: states and poses have a leading axis [N], and so have the vertices."""
-    return jax.vmap(partial(step, vertices=True), (_axes(model), 0, 0))(model, states, poses)
 
+    def one(wearer: Wearer, state: State, pose: Pose) -> tuple[State, Array]:
+        state, vertices = step(dataclasses.replace(model, wearer=wearer), state, pose, vertices=True)
+        assert vertices is not None
+        return state, vertices
 
-def _axes(model: Model) -> Model:
-    """What of a crowd's model has an axis for its characters."""
-    return dataclasses.replace(model, network=None, faces=None, wearer=0)
+    return jax.vmap(one)(model.wearer, states, poses)
 
 
 def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
