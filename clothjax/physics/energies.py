@@ -79,8 +79,8 @@ def stretching(
     corners: Float[Array, "F 3 3"],
     inverse: Float[Array, "F 2 2"],
     area: Float[Array, " F"],
-    mu: Scalar,
-    lam: Scalar,
+    mu: Scalar | Float[Array, " F"],
+    lam: Scalar | Float[Array, " F"],
     thickness: float = THICKNESS,
 ) -> Float[Array, " F"]:
     """Saint Venant-Kirchhoff energy [F] J: A h (mu tr(G^2) + lambda/2 tr(G)^2) of triangles [F, 3, 3] m."""
@@ -109,7 +109,10 @@ def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
 
 
 def bending(
-    corners: Float[Array, "H 4 3"], area: Float[Array, " H"], rest_angle: Float[Array, " H"], stiffness: Scalar
+    corners: Float[Array, "H 4 3"],
+    area: Float[Array, " H"],
+    rest_angle: Float[Array, " H"],
+    stiffness: Scalar | Float[Array, " H"],
 ) -> Float[Array, " H"]:
     """Dihedral energy [H] J: k l^2 / (4 A) (theta - theta_0)^2 / 2, l the current edge, A the rest area."""
     edge = corners[:, 1] - corners[:, 0]
@@ -117,12 +120,14 @@ def bending(
     return stiffness * jnp.sum(edge * edge, axis=-1) / (8.0 * area) * angle * angle
 
 
-def gravity(height: Float[Array, " V"], mass: Float[Array, " V"]) -> Float[Array, " V"]:
+def gravity(height: Float[Array, "*n"], mass: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Potential energy [V] J of masses [V] kg raised by `height` [V] m."""
     return GRAVITY * mass * height
 
 
-def inertia(deviation: Float[Array, "V 3"], mass: Float[Array, " V"], timestep: Scalar) -> Float[Array, " V"]:
+def inertia(
+    deviation: Float[Array, "*n 3"], mass: Float[Array, "*n"], timestep: Scalar | Float[Array, "*n"]
+) -> Float[Array, "*n"]:
     """Incremental kinetic potential [V] J: m |x - x_t - v_t|^2 / (2 dt^2) of the deviation x - x_t - v_t, m."""
     return mass * jnp.sum(deviation * deviation, axis=-1) / (2.0 * timestep * timestep)
 
