@@ -205,7 +205,7 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
 
     coding = peers.write(folder / "codes.onnx", peer, whole=False)
     try:
-        usual = [assembly.motion(experiment, name) for name in specialise.CLIPS]
+        usual = [assembly.motion(experiment, name) for name in specialise.CALIBRATION_CLIPS]
     except ValueError:  # for another body
         usual = case.clips
     codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])

@@ -52,7 +52,7 @@ def test_float32_is_as_good_as_it_can_be_near_the_origin_and_far(away):
 def test_a_sum_that_cancels_is_found_far_from_the_origin(monkeypatch):
     from clothjax.physics import incremental_potential as losses
 
-    def absolute(ends, contact, config):
+    def absolute(ends, contact, config, _laws):
         place = ends[..., 0, :] + contact.place[..., None] * (ends[..., 1, :] - ends[..., 0, :])
         distance = jnp.sum(place * contact.normal_next, axis=-1) - jnp.sum(
             contact.point_next * contact.normal_next, axis=-1
