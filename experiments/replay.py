@@ -60,8 +60,8 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
     if found.step >= total:
         raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")
     experiment = assembly.assemble(config)
-    reel, _ = assembly.training_clips(experiment)
-    update, turn, state = _again(run, stage, experiment, reel)
+    clips, _ = assembly.training_clips(experiment)
+    update, turn, state = _again(run, stage, experiment, clips)
     state, _ = checkpoint.restore(start, state)
     print(f"from step {found.step} of {start}", flush=True)
     end, skipped = min(found.step + steps, total), 0
@@ -85,7 +85,7 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
 
 
 def _start(folder: Path) -> tuple[Path, checkpoint.Checkpoint]:
-    """Where to start from: the state that an earlier replay has kept, if it is of this training and later."""
+    """Return the state to start from: that of an earlier replay, if it is of this training and later."""
     usual, kept = folder / "checkpoints", folder / "diverged"
     found = checkpoint.latest(usual)
     if checkpoint.steps(kept):
@@ -96,7 +96,7 @@ def _start(folder: Path) -> tuple[Path, checkpoint.Checkpoint]:
 
 
 def _again(
-    run: Path, stage: str, experiment: assembly.Experiment, reel: Clips
+    run: Path, stage: str, experiment: assembly.Experiment, clips: Clips
 ) -> tuple[Callable, Callable, stage1.TrainingState]:
     """The training step of a stage, what tells the simulations of a step, and a state."""
     config = experiment.config
@@ -105,24 +105,24 @@ def _again(
         _, garment, predictor, normalizers = trained.psi(run)
         phi = trained.phi(run)[1]["params"]
         animator = animators.psi_animator(
-            garment, normalizers, kept, fine_tuning.preconditioners(experiment, reel, phi, normalizers, kept)
+            garment, normalizers, kept, fine_tuning.preconditioners(experiment, clips, phi, normalizers, kept)
         )
         config = fine_tuning.settings(config)
-        state = fine_tuning.init(predictor, experiment.scene, reel, experiment.config)
+        state = fine_tuning.init(predictor, experiment.scene, clips, experiment.config)
     elif config.peer.network:
         animator = animators.baseline_animator(kept)
         state = stage1.init_baseline(
-            experiment.scene, reel, kept, laplacian_shapes.laplacian(experiment.scene, config), config
+            experiment.scene, clips, kept, laplacian_shapes.laplacian(experiment.scene, config), config
         )
     else:
-        animator, state = animators.phi_animator, stage1.init(experiment.scene, reel, config)
+        animator, state = animators.phi_animator, stage1.init(experiment.scene, clips, config)
 
     @partial(jax.jit, static_argnums=2)
-    def turn(state: stage1.TrainingState, reel: Clips, frames: int):
-        return stage1.next_batch(state, experiment.scene, reel, frames, config)
+    def turn(state: stage1.TrainingState, clips: Clips, frames: int):
+        return stage1.next_batch(state, experiment.scene, clips, frames, config)
 
-    update = stage1.make_curriculum(experiment.scene, reel, config, 1, None, animator)
-    return update, lambda state: turn(state, reel, stage1.rollout_length(int(state.step), config)), state
+    update = stage1.make_curriculum(experiment.scene, clips, config, 1, None, animator)
+    return update, lambda state: turn(state, clips, stage1.rollout_length(int(state.step), config)), state
 
 
 def _said(

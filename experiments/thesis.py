@@ -303,7 +303,7 @@ def times(runs: Runs) -> tuple[dict, Section]:
 
 
 def inputs(runs: Runs) -> tuple[dict, Section]:
-    """How many numbers each network reads in a frame."""
+    """Return the count of numbers that each network reads in a frame."""
     figures = {}
     of_it = next(iter(runs.values()))
     if "ours" in of_it:

@@ -61,9 +61,7 @@ def untrained_psi(config: Config):
     import jax.numpy as jnp
 
     from clothjax.material import configured_material
-    from clothjax.networks import decoder as garment_model
-    from clothjax.networks import phi as compact_latent
-    from clothjax.networks import psi as latent_predictor
+    from clothjax.networks import decoder, phi, psi
     from clothjax.networks.normalisation import Normalizers, Scale
     from clothjax.simulation import assembly as experiment
     from clothjax.training import laplacian_shapes as blendshapes
@@ -71,14 +69,14 @@ def untrained_psi(config: Config):
     config = dataclasses.replace(config, motions=("walk_0",), model=dataclasses.replace(config.model, latent=9))
     whole = experiment.assemble(config)
     reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
-    left, channels = compact_latent.latent_size(whole.scene, config.model)
+    left, channels = phi.latent_size(whole.scene, config.model)
     size = left * channels
-    kept = latent_predictor.input_joints(whole.names, config.stage2)
+    kept = psi.input_joints(whole.names, config.stage2)
     count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
-    constants = latent_predictor.constant_inputs(jnp.zeros(10), configured_material(config), config.material)
+    constants = psi.constant_inputs(jnp.zeros(10), configured_material(config), config.material)
     shapes = 0.1 * blendshapes.laplacian(whole.scene, config)
-    garment = garment_model.init(jax.random.key(0), size, shapes, config.model)
-    predictor = latent_predictor.init(jax.random.key(1), size, count, len(constants), config.stage2)
+    garment = decoder.init(jax.random.key(0), size, shapes, config.model)
+    predictor = psi.init(jax.random.key(1), size, count, len(constants), config.stage2)
     rng = np.random.default_rng(0)
 
     def scale(size, limit):

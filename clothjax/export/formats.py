@@ -25,7 +25,7 @@ class Options(NamedTuple):
 
 
 class Format(NamedTuple):
-    """How a format is written and run."""
+    """The way a format is written and run."""
 
     suffix: str
     write: Callable[[Model, Path, Options, dict], Any]  # with what its JSON says about the model
@@ -40,7 +40,7 @@ def _run_onnx(path: Path, model: Model, motion: Motion, options: Options) -> np.
 
 
 def _write_litert(model: Model, path: Path, options: Options, about: dict) -> None:
-    model = specialise.evened(model) if options.int8 else model
+    model = specialise.smoothed(model) if options.int8 else model
     litert.to_litert(model, path, int8=options.int8, about=about)
 
 

@@ -26,14 +26,14 @@ def function(model: Model) -> Callable:
 
 
 def shapes(model: Model) -> dict[str, tuple[int, ...]]:
-    """Of the arguments, all float32."""
+    """Return the shapes of the arguments (all float32)."""
     joints = len(model.parents)
     each = (model.network.first.shape, (2, joints, 3, 3), (2, joints, 3), (2, 3), (joints, 3, 3), (3,))
     return dict(zip(ARGUMENTS, each, strict=True))
 
 
 def told(model: Model) -> dict:
-    """What is to be said about it in a JSON."""
+    """Return the sidecar entries that describe the call."""
     return {
         "arguments": {name: list(shape) for name, shape in shapes(model).items()},
         "results": list(RESULTS),

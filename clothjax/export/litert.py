@@ -25,7 +25,7 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
 
     Args:
         int8: matrices in eight bits, quantised dynamically, but for those that read the pose and that skin; best of a
-            model that `folding.evened` gives.
+            model that `specialise.smoothed` gives.
         about: more entries for the JSON.
 
     Raises:

@@ -40,13 +40,13 @@ def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
 
 
 def packed(model: Model) -> bytes:
-    """What is in the file of a model."""
+    """Describe the contents of a model's file."""
     parts = (array.astype(array.dtype.newbyteorder("<")).tobytes() for array in _arrays(model))
     return b"".join(part + bytes(-len(part) % ALIGN) for part in parts)
 
 
 def _arrays(model: Model) -> Iterator[np.ndarray]:
-    """All of a file in its order."""
+    """Yield the arrays of a file in their order."""
     network, wearer = model.network, model.wearer
     code = len(network.first)
     wide = network.decoder_width

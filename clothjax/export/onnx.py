@@ -120,8 +120,8 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
 
 
 def _sound(g: Graph, count: int) -> tuple[str, str, str]:
-    """Whether the pose is finite [N, 1, 1]; its rotations and translation [N, 1, 9 J + 3], or the last ones, which
-    come third."""
+    """Return whether the pose is finite [N, 1, 1], its rotations and translation [N, 1, 9 J + 3] or else the last ones,
+    and these last ones."""
     given = g("Concat", g.reshape("rotations", 1, 9 * count), g.reshape("translation", 1, 3), axis=2)
     last = g.slice(g.slice("history", 1, 0, 1), 2, 0, 9 * count + 3)
     limits = np.repeat([2.0, inference.FARTHEST], [9 * count, 3]).astype(np.float32)
@@ -158,7 +158,7 @@ def _places(g: Graph, chain: str, joints: Array) -> str:
 
 
 def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tuple[str, np.ndarray]:
-    """The inputs [N, P] of `latent_predictor.pose_inputs`, in another order, and for each its place in that.
+    """The inputs [N, P] of `psi.pose_inputs`, in another order, and for each its place in that.
 
     Args:
         frames: [N, 3, 12 J + 3] rows of the history, the new one first.

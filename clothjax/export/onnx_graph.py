@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from clothjax.runtime.inference import Layer
-from clothjax.runtime.specialise import evening
+from clothjax.runtime.specialise import smoothing_scale
 from clothjax.types import Array
 
 OPSET, IR_VERSION = 17, 8
@@ -81,14 +81,14 @@ class Graph:
         return self("Add", self("Add", self.product(held, kernel), self.product(left, kernel)), layer.bias)
 
     def even(self, x: str, limits: Array | None, layer: Layer) -> str:
-        """`layer` of inputs within +-`limits`, both scaled by `specialise.evening` where matrices have eight bits."""
+        """Add `layer` of inputs within +-`limits`; in eight bits both are scaled by `specialise.smoothing_scale`."""
         if limits is None or not self.int8:
             return self.layer(x, layer)
-        scale = evening(limits, layer.kernel)
+        scale = smoothing_scale(limits, layer.kernel)
         return self.layer(self("Mul", x, 1.0 / scale), Layer(np.asarray(layer.kernel) * scale[:, None], layer.bias))
 
     def all(self, flags: str, axis: int) -> str:
-        """Whether all of bools hold along an axis, which is kept."""
+        """Add a node that tells whether all bools hold along an axis; the axis stays."""
         least = self("ReduceMin", self("Cast", flags, to=self.onnx.TensorProto.FLOAT), axes=[axis], keepdims=1)
         return self("Greater", least, np.float32(0.5))
 

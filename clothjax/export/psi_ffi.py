@@ -34,7 +34,7 @@ class Packed:
 
 
 def available() -> bool:
-    """Whether jax computes on a CPU, and there are the compilers."""
+    """Return True if jax computes on a CPU and the compilers are there."""
     return jax.default_backend() == "cpu" and None not in (native.compiler(), _compiler())
 
 

@@ -21,7 +21,7 @@ class Surface(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """Where a picture is taken from."""
+    """The place and direction that a picture is taken from."""
 
     eye: np.ndarray  # [3] m
     target: np.ndarray  # [3] m

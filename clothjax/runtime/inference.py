@@ -78,7 +78,7 @@ class Network(NamedTuple):
 
 
 class Wearer(NamedTuple):
-    """What the betas and the material of one character decide."""
+    """The part of a model that the betas and the material of one character decide."""
 
     bias: Array  # [H] added to the predictor's first layer
     template: Array  # [3, V] m, the shaped garment in the canonical pose
@@ -106,7 +106,7 @@ class Model:
 
 
 class State(NamedTuple):
-    """What the model carries from frame to frame."""
+    """The state that the model carries from frame to frame."""
 
     latent: Array  # [C] the code, in standard deviations; of a specialised model what is made of it
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
@@ -338,7 +338,7 @@ def _skin(garment: Array, weights: Array, transforms: Array, translation: Array)
 
 @jax.jit
 def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
-    """Whether a step has changed nothing, bool: until the pose changes, no other need be taken.
+    """Return bool: True if a step has changed nothing, so that none need be taken until the pose changes.
 
     Args:
         before, after: the states around the step.

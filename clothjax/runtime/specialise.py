@@ -72,12 +72,12 @@ def without_code(model: Model) -> Model:
     return dataclasses.replace(model, network=network)
 
 
-def evened(model: Model) -> Model:
-    """The same model with its code and its blend shapes scaled by `evening`: for runtimes that quantise all inputs of a
-    layer alike."""
+def smoothed(model: Model) -> Model:
+    """Return the same model with code and blend shapes scaled by `smoothing_scale`, for runtimes that quantise all
+    inputs of a layer alike."""
     network = model.network
     largest = np.abs(ordinary_weights(model)).max(axis=0)
-    of_shapes = evening(largest, network.shapes)
+    of_shapes = smoothing_scale(largest, network.shapes)
     *decoder, last = network.decoder
     wide, mix, read = network.decoder_width, network.mix, network.read
     if mix is not None:
@@ -92,7 +92,7 @@ def evened(model: Model) -> Model:
             scale[-len(read.bias) :] = beside
     else:
         limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
-        scale = evening(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
+        scale = smoothing_scale(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
         read = read._replace(kernel=read.kernel * scale[:, None])
         network = network._replace(code=network.code._replace(kernel=network.code.kernel * scale[:, None]))
     *hidden, final = network.hidden
@@ -108,9 +108,12 @@ def evened(model: Model) -> Model:
     return dataclasses.replace(model, network=network)
 
 
-def evening(limits: Array, kernel: Array) -> np.ndarray:
-    """What inputs [n] are to be divided by, that reach to `limits`, and the rows of their kernel [n, m] multiplied, so
-    that of the two neither is small beside the others (Xiao et al. 2023): eight bits are shared by all of a row."""
+def smoothing_scale(limits: Array, kernel: Array) -> np.ndarray:
+    """Return the scale [n] that balances inputs against weights before int8 (SmoothQuant, Xiao et al. 2023).
+
+    Inputs that reach to `limits` [n] are divided by it, and the rows of their kernel [n, m] multiplied: eight bits are
+    shared by all of a row, so neither may be small beside the others.
+    """
     weights = np.abs(np.asarray(kernel)).max(axis=1)
     return np.sqrt(np.maximum(limits, 1e-6) / np.maximum(weights, 1e-6)).astype(np.float32)
 
@@ -168,7 +171,7 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
 
 
 def ordinary_weights(model: Model) -> np.ndarray:
-    """Blend-shape weights [n, K] of closed loops over embedded clips; of random codes, for a body they do not fit."""
+    """Blend-shape weights [n, K] of rollouts over embedded clips; of random codes, for a body they do not fit."""
     limits = model.network.code_bounds
     try:
         clips = [storage.load_motion(name, model.names) for name in CALIBRATION_CLIPS]
@@ -181,7 +184,7 @@ def ordinary_weights(model: Model) -> np.ndarray:
 
 @jax.jit
 def _codes(model: Model, motion: Motion) -> Array:
-    """The codes [T, C] of a closed loop."""
+    """Return the codes [T, C] of a rollout."""
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
 
     def frame(state, pose):

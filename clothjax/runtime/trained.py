@@ -50,7 +50,7 @@ def find(model: str | Path) -> Path:
 
 
 def folder(name: str) -> Path:
-    """Where a garment that comes with the library is.
+    """Return the folder of a garment that comes with the library.
 
     Raises:
         ValueError: for a name that is none.
@@ -76,7 +76,7 @@ def phi(run: str | Path) -> tuple[Config, dict]:
 
 
 def network(run: str | Path) -> tuple[Config, dict]:
-    """As `phi`, or a baseline's network in its place.
+    """Return the same as `phi`, or a baseline's network in its place.
 
     Raises:
         ValueError: if there is no readable one.
@@ -129,7 +129,7 @@ def packed(run: str | Path) -> bool:
 
 
 def made(packed: str | Path) -> dict[str, Any]:
-    """How a packed model was made, as its report says: the `command`, `seed` and `hours` that are known."""
+    """Return how a packed model was made: the `command`, `seed` and `hours` that its report knows."""
     path = Path(packed) / REPORT
     report = json.loads(path.read_text()) if path.is_file() else {}
     return {name: report[name] for name in ("command", "seed", "hours") if name in report}

@@ -226,7 +226,7 @@ def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
 
 
 def interleaved(calls: dict[str, Call], rounds: int) -> dict[str, float]:
-    """As `timing.interleaved`, in microseconds."""
+    """Time calls like `timing.interleaved`, in microseconds."""
     return {name: 1e6 * seconds for name, seconds in timing.interleaved(calls, rounds, WARM).items()}
 
 

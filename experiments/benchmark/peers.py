@@ -52,7 +52,7 @@ def made(network: str, params: Params, template: np.ndarray, weights: np.ndarray
 
 
 def fewer(peer: Peer, codes: np.ndarray, count: int) -> Peer:
-    """With so many shapes, the principal ones for codes [n, K] that occur: what Psi is given by `folding`."""
+    """Keep so many shapes, the principal ones for codes [n, K] that occur, as `specialise` does for Psi."""
     mix, rows, moved = specialise.principal_rows(codes, peer.shapes.kernel, count)
     return peer._replace(mix=mix, shapes=Layer(rows, peer.shapes.bias + moved))
 

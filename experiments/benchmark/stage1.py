@@ -144,13 +144,13 @@ def convolution(experiment: Experiment, rounds: int) -> dict:
 def compilation(experiment: Experiment) -> dict:
     """Seconds until a training step on a rollout is traced and compiled: without, and with, a persistent cache."""
     config = experiment.config
-    reel, _ = assembly.training_clips(experiment)
-    state = jax.eval_shape(lambda: stage1.init(experiment.scene, reel, config))
+    clips, _ = assembly.training_clips(experiment)
+    state = jax.eval_shape(lambda: stage1.init(experiment.scene, clips, config))
 
     def once() -> float:
         jax.clear_caches()
         began = time.perf_counter()
-        jax.jit(stage1.make_update(experiment.scene, reel, config, COMPILED_FRAMES, 1)).lower(state).compile()
+        jax.jit(stage1.make_update(experiment.scene, clips, config, COMPILED_FRAMES, 1)).lower(state).compile()
         return time.perf_counter() - began
 
     before = jax.config.jax_compilation_cache_dir

@@ -146,7 +146,7 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
 
 
 def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
-    """As `evaluate.psi_trajectory`, of what gives vertices [T, V, 3] m of a motion."""
+    """Return a trajectory like `rollouts.psi_trajectory`, by a function from a motion to vertices [T, V, 3] m."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
     local = part._replace(translation=(part.translation - part.translation[:1]).astype(np.float32))
     return run(local) - local.translation[:, None]

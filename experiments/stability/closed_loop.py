@@ -176,7 +176,7 @@ def at_rate(motion: Motion, fps: float) -> Motion:
 
 
 def drift_mm(track: np.ndarray) -> np.ndarray:
-    """How far the farthest vertex of [T, V, 3] m is from where it was in the first frame, in mm: [T]."""
+    """Return the distance [T] in mm of the farthest vertex of [T, V, 3] m from its place in the first frame."""
     return 1e3 * np.linalg.norm(track - track[:1], axis=-1).max(axis=1)
 
 

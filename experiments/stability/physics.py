@@ -113,7 +113,7 @@ def contacts(random: np.random.Generator, count: int) -> tuple[Callable, np.ndar
 
 
 def count_nonfinite(count: int, seed: int = 0) -> dict[str, dict[str, int]]:
-    """How many of `count` configurations of each term have an energy, gradient or Hessian product that is not finite.
+    """Count, of each term, the configurations whose energy, gradient or Hessian product is not finite.
 
     All are in float32; the Hessian is applied to a random direction.
     """
@@ -157,11 +157,11 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
     character = characters.dress(
         scene, jnp.asarray(assembly.betas(config)), material.configured_material(config), config.physics
     )
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
+    clips = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
 
     @jax.jit
     def state(key):
-        window = characters.window(scene, character, motion_clips.poses(reel, jnp.int32(FRAME)))
+        window = characters.window(scene, character, motion_clips.poses(clips, jnp.int32(FRAME)))
         cloth = time_step.start(character, window, 0)
         shaken = 1e-3 * jax.random.normal(key, (2, *cloth.position.shape))
         cloth = cloth._replace(position=cloth.position + shaken[0])

@@ -28,7 +28,7 @@ INSIDE = 5.0  # percent of the vertices
 
 
 class Outcome(NamedTuple):
-    """How a case ended."""
+    """The outcome of a case."""
 
     seconds: float  # a frame, median
     iterations: int  # the most in a frame

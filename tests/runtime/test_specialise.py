@@ -172,7 +172,7 @@ def test_an_evened_model_is_the_same(wide, motion):
     folded = [specialise.specialise(each) for each in (wide, beside)]
     assert all(each.network.code.kernel is None for each in folded)
     for model in (cj.load("skirt"), specialise.specialise(cj.load("skirt"), blendshapes=50), wide, beside, *folded):
-        even = specialise.evened(model)
+        even = specialise.smoothed(model)
         one, other = (inference.animate(each, clip)[0] for each in (model, even))
         np.testing.assert_allclose(one, other, atol=3e-5)
         reach = np.abs(specialise.ordinary_weights(even)).max(axis=0)
