@@ -102,13 +102,16 @@ def _again(
     config = experiment.config
     kept = psi.input_joints(experiment.names, config.stage2)
     if stage == "tuning":
-        _, garment, predictor, normalizers = trained.psi(run)
+        psi_of_run = trained.psi(run)
         phi = trained.phi(run)[1]["params"]
         animator = animators.psi_animator(
-            garment, normalizers, kept, fine_tuning.preconditioners(experiment, clips, phi, normalizers, kept)
+            psi_of_run.garment,
+            psi_of_run.normalizers,
+            kept,
+            fine_tuning.preconditioners(experiment, clips, phi, psi_of_run.normalizers, kept),
         )
         config = fine_tuning.settings(config)
-        state = fine_tuning.init(predictor, experiment.scene, clips, experiment.config)
+        state = fine_tuning.init(psi_of_run.predictor, experiment.scene, clips, experiment.config)
     elif config.peer.network:
         animator = animators.baseline_animator(kept)
         state = stage1.init_baseline(

@@ -307,7 +307,7 @@ def inputs(runs: Runs) -> tuple[dict, Section]:
     figures = {}
     of_it = next(iter(runs.values()))
     if "ours" in of_it:
-        _, _, predictor, normalizers = trained.psi(of_it["ours"])
+        predictor, normalizers = trained.psi(of_it["ours"])[2:]
         code, pose = (len(part.mean) for part in normalizers)
         rows = len(predictor["dense_0"]["kernel"])
         figures["ours"] = {"code": code, "pose": pose, "wearer": rows - code - pose, "all": rows}

@@ -35,14 +35,17 @@ def main(argv: list[str]) -> None:
     if config.tuning.steps < 1:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
-    _, garment, predictor, normalizers = trained.psi(folder)
+    psi_of_folder = trained.psi(folder)
     experiment = assembly.assemble(config)
     clips, _ = assembly.training_clips(experiment)
     kept = psi.input_joints(experiment.names, config.stage2)
     seen = stage2.ordinary_poses(experiment.scene, clips, kept, config)
-    normalizers = normalizers._replace(pose=normalisation.widened(normalizers.pose, seen))
+    scales = psi_of_folder.normalizers
+    normalizers = scales._replace(pose=normalisation.widened(scales.pose, seen))
     run = pipeline.Run(experiment, given.out, clips, None)
-    tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(garment, predictor, normalizers))
+    tuned = pipeline.fine_tune(
+        run, phi["params"], pipeline.Psi(psi_of_folder.garment, psi_of_folder.predictor, normalizers)
+    )
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
     made = trained.made(folder)
     command = shlex.join(["python", "-m", "experiments.tune", *argv])

@@ -50,7 +50,7 @@ def main(argv: list[str]) -> None:
     run = cli.model_folder(arguments.model)
     betas = None
     if arguments.betas is not None:
-        count = storage.load_body(trained.psi(run)[0].body).shapedirs.shape[-1]
+        count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]
         if len(arguments.betas) > count:
             raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))

@@ -8,7 +8,7 @@ preconditioner in half precision, all else as it is.
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -92,9 +92,17 @@ def network(run: str | Path) -> tuple[Config, dict]:
     return config, {"params": params, "statistics": statistics}
 
 
-def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
-    """The configuration, the decoder with its blend shapes, the predictor (after all that trained it) and its
-    normalizers, of a run or a packed model. Of Psi without stage 1, the normalizers change nothing.
+class TrainedPsi(NamedTuple):
+    """All that Psi is after its training."""
+
+    config: Config
+    garment: dict  # parameters of the decoder, with its blend shapes
+    predictor: dict  # after all that trained it
+    normalizers: Normalizers  # of Psi without stage 1, they change nothing
+
+
+def psi(run: str | Path) -> TrainedPsi:
+    """Read Psi of a run or a packed model.
 
     Raises:
         ValueError: if there is no readable one.
@@ -120,7 +128,7 @@ def psi(run: str | Path) -> tuple[Config, dict, dict, Normalizers]:
             if checkpoint.steps(trained_on):
                 predictor = checkpoint.read(trained_on, "average")[0]["average"]
         normalizers = _normalizers(parts["normalizers"])
-    return config, garment, predictor, normalizers
+    return TrainedPsi(config, garment, predictor, normalizers)
 
 
 def packed(run: str | Path) -> bool:

@@ -100,7 +100,9 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
     size = trained.pack(finished, tmp_path / "toy")
     assert trained.shipped() == ("toy",) and size == (tmp_path / "toy" / "model.npz").stat().st_size
     config, model = trained.phi(finished)
-    assert size < 0.5 * sum(leaf.nbytes for part in (model, trained.psi(finished)[2]) for leaf in jax.tree.leaves(part))
+    assert size < 0.5 * sum(
+        leaf.nbytes for part in (model, trained.psi(finished).predictor) for leaf in jax.tree.leaves(part)
+    )
     config_packed, model_packed = trained.phi(tmp_path / "toy")
     assert config_packed == config
     for (name, one), other in zip(
@@ -124,7 +126,7 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     shutil.rmtree(run / "tuning")
-    assert trained.psi(run)[0].tuning.steps == 20  # as stage 2 was told
+    assert trained.psi(run).config.tuning.steps == 20  # as stage 2 was told
     with pytest.raises(ValueError, match="tuning is at step 0 of 20"):
         trained.pack(run, tmp_path / "packed")
     assert not (tmp_path / "packed").exists()
