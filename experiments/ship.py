@@ -23,7 +23,7 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     run, folder = cli.model_folder(arguments.model), trained.MODELS / arguments.name
     if trained.packed(run):
-        packed, about = run, trained.made(run)
+        packed, about = run, trained.provenance(run)
     else:
         packed = run / "packed" / arguments.name
         size = trained.pack(run, packed)

@@ -307,9 +307,9 @@ def inputs(runs: Runs) -> tuple[dict, Section]:
     figures = {}
     of_it = next(iter(runs.values()))
     if "ours" in of_it:
-        _, _, predictor, normalizers = trained.psi(of_it["ours"])
-        code, pose = (len(part.mean) for part in normalizers)
-        rows = len(predictor["dense_0"]["kernel"])
+        psi = trained.psi(of_it["ours"])
+        code, pose = (len(part.mean) for part in psi.normalizers)
+        rows = len(psi.predictor["dense_0"]["kernel"])
         figures["ours"] = {"code": code, "pose": pose, "wearer": rows - code - pose, "all": rows}
     if "ncs" in of_it:
         params = trained.network(of_it["ncs"])[1]["params"]

@@ -35,20 +35,20 @@ def main(argv: list[str]) -> None:
     if config.tuning.steps < 1:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
-    _, garment, predictor, normalizers = trained.psi(folder)
+    source = trained.psi(folder)
     experiment = assembly.assemble(config)
-    reel, _ = assembly.training_clips(experiment)
-    kept = psi.input_joints(experiment.names, config.stage2)
-    seen = stage2.ordinary_poses(experiment.scene, reel, kept, config)
-    normalizers = normalizers._replace(pose=normalisation.widened(normalizers.pose, seen))
-    run = pipeline.Run(experiment, given.out, reel, None)
-    tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(garment, predictor, normalizers))
+    clips, _ = assembly.training_clips(experiment)
+    input_joints = psi.input_joints(experiment.names, config.stage2)
+    seen = stage2.ordinary_poses(experiment.scene, clips, input_joints, config)
+    normalizers = source.normalizers._replace(pose=normalisation.widened(source.normalizers.pose, seen))
+    run = pipeline.Run(experiment, given.out, clips, None)
+    tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(source.garment, source.predictor, normalizers))
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
-    made = trained.made(folder)
+    about = trained.provenance(folder)
     command = shlex.join(["python", "-m", "experiments.tune", *argv])
-    made["command"] = f"{made['command']} && {command}" if "command" in made else command
-    made["hours"] = made.get("hours", 0.0) + (tuned.seconds + tuned.compile_seconds) / 3600
-    (given.out / trained.REPORT).write_text(json.dumps(made, indent=1) + "\n")
+    about["command"] = f"{about['command']} && {command}" if "command" in about else command
+    about["hours"] = about.get("hours", 0.0) + (tuned.seconds + tuned.compile_seconds) / 3600
+    (given.out / trained.REPORT).write_text(json.dumps(about, indent=1) + "\n")
     print(f"{given.out}: {size / 1e6:.2f} MB of weights")
 
 

@@ -50,7 +50,7 @@ def main(argv: list[str]) -> None:
     run = cli.model_folder(arguments.model)
     betas = None
     if arguments.betas is not None:
-        count = storage.load_body(trained.psi(run)[0].body).shapedirs.shape[-1]
+        count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]
         if len(arguments.betas) > count:
             raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
@@ -63,7 +63,7 @@ def main(argv: list[str]) -> None:
     error = formats.export(model, arguments.to, out, options, about, _validation(model))
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
     if error is None:
-        print(f"not compared: {form.unrun}")
+        print(f"not compared: {form.not_run}")
     else:
         print(
             f"over {error['frames']} frames of autoregressive rollout: {error['mean_mm']:.4f} mm on average, "

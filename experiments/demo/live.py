@@ -194,7 +194,7 @@ class Show:
         fine: bool = False,
     ) -> None:
         """Another garment, body or number of characters; `betas` may be some of those that the body has."""
-        config = trained.psi(run)[0]
+        config = trained.psi(run).config
         if config.fps != self.player.clips.fps:
             raise ValueError(f"the clips are at {self.player.clips.fps} frames a second, {run} at {config.fps}")
         self._pose_body, body = _body(config.body)

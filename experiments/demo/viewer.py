@@ -247,7 +247,7 @@ def start(arguments: argparse.Namespace) -> Viewer:
     if garment not in garments:  # a folder stands alone: its body may be another
         folder = cli.model_folder(garment)
         garments, garment = {folder.name: folder}, folder.name
-    config = trained.psi(garments[garment])[0]
+    config = trained.psi(garments[garment]).config
     body, names = storage.load_body(config.body), storage.joint_names(config.body)
     motions = clips(arguments.motions, names)
     found = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
