@@ -41,7 +41,7 @@ def clip(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> tuple
     inside = distance[faces] <= 0
     count = inside.sum(axis=1)
     kept = faces[count == 3].tolist()
-    for face, within in zip(faces.tolist(), inside):
+    for face, within in zip(faces.tolist(), inside, strict=True):
         if within.sum() not in (1, 2):
             continue
         odd = int(np.argmax(within)) if within.sum() == 1 else int(np.argmin(within))

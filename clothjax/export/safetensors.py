@@ -43,7 +43,7 @@ def from_safetensors(path: str | Path) -> Model:
     try:
         with library.safe_open(str(path), framework="numpy") as file:
             about = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
-            arrays = {name: jnp.asarray(file.get_tensor(name)) for name in file.keys()}  # not a dict
+            arrays = {name: jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())}  # not a dict
         storage.refuse_newer(path, about.get("format", 1), FORMAT)
         config = configuration.from_dict(Config, about["config"], str(path))
         static = {field: tuple(about[name]) for name, field in STATIC.items()}

@@ -341,7 +341,7 @@ def plot(report: dict, path: Path) -> None:
     for runtime, label in (("onnx", "ONNX Runtime"), ("jax", "jax"), ("c", "plain C, eight bits")):
         chosen = [p for p in points if p[3] == runtime]
         axis.loglog([p[0] for p in chosen], [p[1] for p in chosen], "o", label=label)
-    corners = dict(color="black", lw=0.8, where="post", label="Pareto front")
+    corners = {"color": "black", "lw": 0.8, "where": "post", "label": "Pareto front"}
     axis.step([p[0] for p in front], [p[1] for p in front], **corners)
     for us, error, name, runtime in points:
         if (us, error, name, runtime) in front or runtime == "jax":

@@ -62,7 +62,7 @@ def measure(
     cases = [prepare(of_it, motions, frames) for of_it in garments.values()]
     points = []
     with progress_bar("garments", len(garments)) as report, tempfile.TemporaryDirectory() as folder:
-        for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items())):
+        for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items(), strict=True)):
             variants, solved = every(case, of_it, Path(folder), descent_steps, iterations, shapes)
             us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
             for key, each in variants.items():
@@ -168,16 +168,16 @@ def plot(report: dict, path: Path | BinaryIO) -> None:
     garments = list(dict.fromkeys(point["garment"] for point in points))
     size = (5 * len(ERRORS), 4.2 * len(garments))
     figure, axes = plt.subplots(len(garments), len(ERRORS), figsize=size, squeeze=False, constrained_layout=True)
-    for row, garment in zip(axes, garments):
+    for row, garment in zip(axes, garments, strict=True):
         of_it = [point for point in points if point["garment"] == garment]
-        for axis, (error, label) in zip(row, ERRORS.items()):
+        for axis, (error, label) in zip(row, ERRORS.items(), strict=True):
             for family, runtime in dict.fromkeys((point["family"], point["runtime"]) for point in of_it):
                 chosen = [point for point in of_it if (point["family"], point["runtime"]) == (family, runtime)]
                 where = [p["us"] for p in chosen], np.clip([p[error] for p in chosen], LEAST[error], MOST[error])
                 style = {"ms": 5, "alpha": 0.8, "color": COLOURS[family], "label": f"{family} ({runtime})"}
                 axis.loglog(*where, MARKERS[runtime], **style)
             front = sorted((p["us"], max(p[error], LEAST[error])) for p in of_it if p["front"][error])
-            axis.step(*zip(*front), color="black", lw=0.8, where="post")
+            axis.step(*zip(*front, strict=True), color="black", lw=0.8, where="post")
             axis.set(xlabel="us a frame", ylabel=label, title=garment)
             axis.spines[["top", "right"]].set_visible(False)
     axes[0, 0].legend(title="Pareto front: line", fontsize=8)

@@ -47,7 +47,9 @@ class Xpbd:
             radius=[config.collision_offset] * len(mass),
         )  # fmt: skip
         edges = topology.edges(faces)
-        for (i, j), stiffness in zip(edges, springs(template, faces, edges, float(material.mu), float(material.lam))):
+        for (i, j), stiffness in zip(
+            edges, springs(template, faces, edges, float(material.mu), float(material.lam)), strict=True
+        ):
             builder.add_spring(int(i), int(j), float(stiffness), 0.0, 0)
         a, b, left, right = np.asarray(scene.mesh.hinges).T
         squared = np.sum((template[a] - template[b]) ** 2, axis=1)

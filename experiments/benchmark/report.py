@@ -119,7 +119,7 @@ def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
             command = [sys.executable, "-m", "experiments.benchmark", *(runs if part == "pareto" else [])]
             command += ["--part", part, "--json", str(path), "--plot", str(plot), *(["--quick"] if quick else [])]
             print(f"part {part}", flush=True)
-            if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
+            if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode != 0:
                 raise ValueError(
                     f"the part {part} failed, as said above: run it alone with --part {part}; what was measured before "
                     f"it is in {kept}"

@@ -44,7 +44,7 @@ def process(params, statistics, scene, seen, config) -> Array:
     graph["world"] = (jnp.concatenate([slot, vertex]), jnp.concatenate([vertex, slot]))
     pairs = jnp.concatenate([seen.world.to_garment, seen.world.to_body])
     edges["world"] = mlp(encoder["world"], normalisation.standardise(statistics["world"], pairs))
-    for stack, stacked in zip(config.processor, params["processor"].values()):
+    for stack, stacked in zip(config.processor, params["processor"].values(), strict=True):
         active = seen.world.active & jnp.asarray(scene.level >= stack.lowest_level)
         keep = jnp.concatenate([active, active])[:, None]
         for index in range(stack.blocks):

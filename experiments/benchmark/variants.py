@@ -61,7 +61,7 @@ def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
     configs = [trained.network(run)[0] for run in runs]
     first = configs[0]
     wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
-    for run, config, wearer in zip(runs, configs, wearers):
+    for run, config, wearer in zip(runs, configs, wearers, strict=True):
         differing = [name for name in ALIKE if getattr(config, name) != getattr(first, name)]
         differing += ["betas"] * (wearer != wearers[0])
         if differing:
@@ -205,7 +205,7 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
 
     coding = peers.write(folder / "codes.onnx", peer, whole=False)
     try:
-        usual = [assembly.motion(experiment, name) for name in specialise.CLIPS]
+        usual = [assembly.motion(experiment, name) for name in specialise.CALIBRATION_CLIPS]
     except ValueError:  # for another body
         usual = case.clips
     codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])
@@ -219,7 +219,7 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
     for name, form in forms.items():
         for int8 in (False, True):
             path = peers.write(folder / f"{len(variants)}.onnx", form, int8=int8)
-            tracks = [np.concatenate([start, peers.run(path, of)[:-1]]) for start, of in zip(first, seen)]
+            tracks = [np.concatenate([start, peers.run(path, of)[:-1]]) for start, of in zip(first, seen, strict=True)]
             label = f"{name}, int8" if int8 else name
             variants[label] = Variant(network, "onnx", tracks, bound(path, peers.feed(path)))
     return variants
@@ -263,7 +263,7 @@ def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
             position_based.simulate(engine, experiment, case.character, windows(clip), start)
             for clip, start in zip(case.clips, starts, strict=True)
         ]
-        tracks, us = zip(*loops)
+        tracks, us = zip(*loops, strict=True)
         name = f"xpbd, {substeps} substeps of {iterations} iteration{'s' * (iterations > 1)}"
         variants[name] = Variant("xpbd", "warp", list(tracks), None, float(np.median(us)))
     return variants

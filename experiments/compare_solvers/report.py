@@ -20,6 +20,7 @@ number of iterations (`--iterations` a frame, shared by its substeps), so that a
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -50,7 +51,9 @@ DISTURBANCE = 1e-6  # m
 AT_REST = 2  # substeps of `hang`: few, for their damping
 
 
-def simulate(engines: dict, frames: int, substeps: int, report=lambda frame: None) -> tuple[dict, dict]:
+def simulate(
+    engines: dict, frames: int, substeps: int, report: Callable[[int], None] = lambda _: None
+) -> tuple[dict, dict]:
     """Positions [T, V, 3] m of every engine, which take turns frame by frame, and median seconds of a frame."""
     tracks, seconds = {name: [] for name in engines}, {name: [] for name in engines}
     for frame in range(frames):

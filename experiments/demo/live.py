@@ -65,7 +65,7 @@ class Outfit:
 
     def psi(self, poses: list[Pose]) -> np.ndarray:
         """Vertices [N, V, 3] m of the next frame of the characters, whose poses these are."""
-        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses)))
+        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
         if self._states is None:
             self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(given)
         self._states, vertices = inference.step_crowd(self._crowd, self._states, given)
@@ -218,12 +218,15 @@ class Show:
         self.frames += 1
         poses = [self.past[max(len(self.past) - 1 - BEHIND * i, 0)] for i in range(self.outfit.count)]
         shift = np.stack([_place(i, each, pose) for i, each in enumerate(poses)])
-        bodies = [np.asarray(self._pose_body(*self._shape, each)) + by for each, by in zip(poses[:BODIES], shift)]
+        bodies = [
+            np.asarray(self._pose_body(*self._shape, each)) + by
+            for each, by in zip(poses[:BODIES], shift, strict=False)
+        ]
         paused = time.perf_counter()
         shown = {"psi": self.outfit.psi(poses) + shift[:, None]}
         self.seconds = {"psi": time.perf_counter() - paused, "pose": paused - began}
         newest = [self.past[max(len(self.past) - 3 + i, 0)] for i in range(3)]
-        window = Pose(*(np.stack(each) for each in zip(*newest)))
+        window = Pose(*(np.stack(each) for each in zip(*newest, strict=True)))
         others = [stage for stage in self.stages if stage != "psi"]
         for i, (stage, vertices) in enumerate(self.outfit.beside(others, window).items()):
             aside = np.array([APART * (i + 1), 0.0, 0.0], np.float32)

@@ -143,17 +143,20 @@ class Viewer:
         run = self.garments[self.garment.value]
         self.show.dress(run, betas, material, int(self.count.value), self.fine.value)
 
+    def _remove_meshes(self) -> None:
+        self._draw_anew = False
+        for mesh in self.meshes.values():
+            mesh.remove()
+        self.meshes.clear()
+
     def _draw(self) -> None:
         if self._draw_anew:  # other faces, or another look
-            self._draw_anew = False
-            for mesh in self.meshes.values():
-                mesh.remove()
-            self.meshes.clear()
+            self._remove_meshes()
         if self._shown is None:
             return
         garments, bodies = self._shown
         others = [stage for stage in garments if stage != "psi"]
-        worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :]))
+        worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :], strict=True))
         here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
         here = here + [0.65 * APART * len(others), 0, 0]  # all in what the panel leaves free
         drawn = set()

@@ -82,7 +82,7 @@ def body(whole: Body, path: Path) -> dict:
     }
     path.write_bytes(b"".join(array.tobytes() for array in arrays.values()))
     ends = np.cumsum([0, *(array.nbytes for array in arrays.values())])
-    places = {name: [int(at), array.size] for (name, array), at in zip(arrays.items(), ends)}
+    places = {name: [int(at), array.size] for (name, array), at in zip(arrays.items(), ends, strict=False)}
     return {"body": places, "joints": np.asarray(whole.joints).tolist(), "parents": [int(p) for p in whole.parents]}
 
 
@@ -105,7 +105,9 @@ def bundle(out: Path) -> None:
 
 
 def _run(command: list[str], folder: Path) -> None:
-    done = subprocess.run([shutil.which(command[0]), *command[1:]], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [shutil.which(command[0]), *command[1:]], cwd=folder, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise ValueError(f"{' '.join(command)} failed: {(done.stderr or done.stdout).strip()}")
 
