@@ -118,8 +118,8 @@ def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, 
 def _reason(error: Exception) -> str:
     """The line of a job's traceback that says what went wrong; else the last line there is."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
-    said = [line for line in lines if re.match(r"[\w.]+(Error|Exit|Interrupt)\b", line)]
-    return (said or lines or [type(error).__name__])[-1]
+    causes = [line for line in lines if re.match(r"[\w.]+(Error|Exit|Interrupt)\b", line)]
+    return (causes or lines or [type(error).__name__])[-1]
 
 
 def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:

@@ -169,9 +169,9 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
             figures[garment] |= {name: values for name, values in measured.items() if name != "lbs"}
             config = trained.network(run)[0]
             motion = config.evaluation.motions[0]
-            kept = Tracks.load(run, motion)
-            tracks |= {name: track for name, track in kept.stages.items() if name != "lbs"}
-            solver = kept.solver
+            saved = Tracks.load(run, motion)
+            tracks |= {name: track for name, track in saved.stages.items() if name != "lbs"}
+            solver = saved.solver
         experiment = assembly.assemble(config)
         rows, columns = pictures.at_moments(experiment, motion, tracks | {"solver": solver}, MOMENTS)
         parts.append(f"<h3>{garment}</h3>" + table(figures[garment]) + sheet(rows, columns))
@@ -205,8 +205,8 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
         figures[stage] = measures(of_it[key])[stage]
         config = trained.network(of_it[key])[0]
         motion = config.evaluation.motions[0]
-        kept = Tracks.load(of_it[key], motion)
-        tracks |= {stage: kept.stages[stage], "solver": kept.solver}
+        saved = Tracks.load(of_it[key], motion)
+        tracks |= {stage: saved.stages[stage], "solver": saved.solver}
     rows, columns = pictures.at_moments(assembly.assemble(config), motion, tracks, MOMENTS)
     text = "<p>Predictor, decoder and blend shapes trained on the losses alone, for the same time.</p>"
     return figures, (title, text + table(figures) + sheet(rows, columns))

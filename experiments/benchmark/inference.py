@@ -23,7 +23,7 @@ from clothjax.runtime import inference, specialise
 from clothjax.runtime.inference import Model
 from clothjax.simulation import assembly
 from clothjax.types import Motion, Pose
-from experiments.benchmark import peers, timing
+from experiments.benchmark import baselines, timing
 from experiments.benchmark.timing import Call
 
 matplotlib.use("Agg")
@@ -55,8 +55,8 @@ def paper_model() -> Model:
     """Psi at the size of the thesis on the 4 000-vertex t-shirt, with random weights."""
     config = configuration.cli(Config, PAPER)
     experiment = assembly.assemble(config)
-    kept = psi.input_joints(experiment.names, config.stage2)
-    size, count = config.model.latent, 6 + 18 * len(kept) + 9 * (len(kept) - 1)
+    input_joints = psi.input_joints(experiment.names, config.stage2)
+    size, count = config.model.latent, 6 + 18 * len(input_joints) + 9 * (len(input_joints) - 1)
     random = np.random.default_rng(0)
     basis = 1e-3 * random.standard_normal((config.model.blendshapes, len(experiment.garment.vertices), 3)).astype(
         np.float32
@@ -93,13 +93,13 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
             path = onnx.to_onnx(model, folder / "psi.onnx", int8=int8)
             kinds[kind] = errors[kind]
             calls[f"psi: {kind}"], size[f"psi: {kind}"] = onnx_call(path, model), path.stat().st_size
-            path = given_features(model, folder / "network.onnx", int8=int8, whole=False)
+            path = given_features(model, folder / "network.onnx", int8=int8, skinned=False)
             calls[f"psi network: {kind}"], size[f"psi network: {kind}"] = session_call(path), path.stat().st_size
-    peer = peers.published(vertices)
+    ncs = baselines.published(vertices)
     for int8 in (False, True):
-        for whole in (True, False):
-            name = f"ncs{'' if whole else ' network'}{': int8' if int8 else ''}"
-            path = peers.write(folder / "ncs.onnx", peer, int8=int8, whole=whole)
+        for skinned in (True, False):
+            name = f"ncs{'' if skinned else ' network'}{': int8' if int8 else ''}"
+            path = baselines.write(folder / "ncs.onnx", ncs, int8=int8, skinned=skinned)
             calls[name], size[name] = session_call(path), path.stat().st_size
     calls |= {f"jax: {name}": jax_call(forms[name]) for name in ("plain", "folded")}
     library = _library(folder)
@@ -239,7 +239,7 @@ def onnx_call(path: Path, model: Model) -> Call:
 
 def session_call(path: Path) -> Call:
     """One call of a graph on random inputs."""
-    return bound(path, peers.feed(path))
+    return bound(path, baselines.feed(path))
 
 
 def bound(path: Path, feed: dict[str, np.ndarray]) -> Call:
@@ -295,17 +295,17 @@ def _fewer(model: Model) -> dict[str, Model]:
     }
 
 
-def given_features(model: Model, path: Path, *, int8: bool, whole: bool = True) -> Path:
-    """Psi spared what NCS and SNUG are spared in `peers.write`: pose inputs and skinning transforms are given.
+def given_features(model: Model, path: Path, *, int8: bool, skinned: bool = True) -> Path:
+    """Psi spared what NCS and SNUG are spared in `baselines.write`: pose inputs and skinning transforms are given.
 
     Args:
-        whole: with blend shapes and skinning; else to the weights of the shapes.
+        skinned: with blend shapes and skinning; else to the weights of the shapes.
     """
     g, network = Graph(int8), model.network
     count, size, vertices = len(network.pose_mean), len(network.first), model.wearer.template.shape[1]
     given, found = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
-    if whole:
+    if skinned:
         given["transforms"], found["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
         moved = g.skinned(onnx.canonical(g, latent, model), "transforms", network.weights)
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")

@@ -105,14 +105,14 @@ def draw(report: dict, part: str, path: Path) -> None:
     print(f"drawn in {path}")
 
 
-def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
+def each_part(runs: list[str], quick: bool, report_path: Path, plot: Path) -> dict:
     """Every part, each in a process of its own: they differ in how many cores jax may use.
 
     Args:
-        kept: where the report so far is written after each part, should the next one fail.
+        report_path: where the report so far is written after each part, should the next one fail.
     """
     report = {}
-    kept.parent.mkdir(parents=True, exist_ok=True)
+    report_path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for part in PARTS:
             path = Path(folder) / f"{part}.json"
@@ -122,10 +122,10 @@ def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
             if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode != 0:
                 raise ValueError(
                     f"the part {part} failed, as said above: run it alone with --part {part}; what was measured before "
-                    f"it is in {kept}"
+                    f"it is in {report_path}"
                 )
             report |= json.loads(path.read_text())
-            kept.write_text(json.dumps(report, indent=1) + "\n")
+            report_path.write_text(json.dumps(report, indent=1) + "\n")
     return report
 
 

@@ -24,15 +24,15 @@ def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
     """Seconds of a training step on t-shirts of about so many vertices, and the exponent of their growth."""
     body, names = storage.load_body(config.body), storage.joint_names(config.body)
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
-    programs, reel = {}, None
+    programs, clips = {}, None
     with progress_bar("compiling for each size", len(sizes)) as report:
         for done, size in enumerate(sizes):
             cloth = garment.build("tshirt", size, body, names)
             built = scene.build_scene(cloth, body, config)
             experiment = assembly.Experiment(config, names, body, cloth, built)
-            reel = reel or assembly.training_clips(experiment)[0]
-            update = stage1.make_update(built, reel, config, 1, 1)
-            programs[len(cloth.vertices)] = program(update, stage1.init(built, reel, config))
+            clips = clips or assembly.training_clips(experiment)[0]
+            update = stage1.make_update(built, clips, config, 1, 1)
+            programs[len(cloth.vertices)] = program(update, stage1.init(built, clips, config))
             report(done + 1)
     seconds = interleaved(programs, rounds)
     exponent, _ = np.polyfit(np.log(list(seconds)), np.log(list(seconds.values())), 1)

@@ -76,14 +76,14 @@ def build(experiment: Experiment, name: str) -> Experiment:
 
 def update(experiment: Experiment):
     """A training step and the state it starts from."""
-    reel = _standing(experiment) if experiment.scene.still else assembly.training_clips(experiment)[0]
-    return stage1.make_update(experiment.scene, reel, experiment.config, 1, 1), stage1.init(
-        experiment.scene, reel, experiment.config
+    clips = _standing(experiment) if experiment.scene.still else assembly.training_clips(experiment)[0]
+    return stage1.make_update(experiment.scene, clips, experiment.config, 1, 1), stage1.init(
+        experiment.scene, clips, experiment.config
     )
 
 
 def _standing(experiment: Experiment):
-    """A reel of one pose."""
+    """Return clips of one pose."""
     names = assembly.training_motions(experiment.config)
     clip = assembly.motion(experiment._replace(scene=experiment.scene._replace(still=False)), names[0])
     pose = Motion(np.repeat(clip.rotations[:1], 30, 0), np.repeat(clip.translation[:1], 30, 0), clip.fps)

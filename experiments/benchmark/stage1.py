@@ -72,11 +72,11 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
     params = {name: state.params[name] for name in names}
     forms = {"ours": passed, "textbook": textbook.process}
     arguments = (params, state.statistics, moment.first.seen)
-    kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
+    stored, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
     programs = {
         "ours": program(loss(forms["ours"], recomputed), *arguments),
-        "ours, nothing recomputed": program(loss(forms["ours"], kept), *arguments),
-        "textbook": program(loss(forms["textbook"], kept), *arguments),
+        "ours, nothing recomputed": program(loss(forms["ours"], stored), *arguments),
+        "textbook": program(loss(forms["textbook"], stored), *arguments),
     }
     seconds = interleaved(programs, rounds)
     memory = {name: temporary_bytes(one) for name, one in programs.items()}
@@ -144,13 +144,13 @@ def convolution(experiment: Experiment, rounds: int) -> dict:
 def compilation(experiment: Experiment) -> dict:
     """Seconds until a training step on a rollout is traced and compiled: without, and with, a persistent cache."""
     config = experiment.config
-    reel, _ = assembly.training_clips(experiment)
-    state = jax.eval_shape(lambda: stage1.init(experiment.scene, reel, config))
+    clips, _ = assembly.training_clips(experiment)
+    state = jax.eval_shape(lambda: stage1.init(experiment.scene, clips, config))
 
     def once() -> float:
         jax.clear_caches()
         began = time.perf_counter()
-        jax.jit(stage1.make_update(experiment.scene, reel, config, COMPILED_FRAMES, 1)).lower(state).compile()
+        jax.jit(stage1.make_update(experiment.scene, clips, config, COMPILED_FRAMES, 1)).lower(state).compile()
         return time.perf_counter() - began
 
     before = jax.config.jax_compilation_cache_dir

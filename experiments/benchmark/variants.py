@@ -18,14 +18,15 @@ from clothjax.evaluation.rollouts import load_run, skinned_trajectory, windows
 from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.files import storage
-from clothjax.networks import baselines, psi
+from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
+from clothjax.networks.baselines import inputs as baseline_inputs
 from clothjax.runtime import inference, specialise, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Motion, Pose
-from experiments.benchmark import peers, position_based
+from experiments.benchmark import baselines, position_based
 from experiments.benchmark.inference import bound, c_call, given_features, onnx_call, session_call
 from experiments.benchmark.position_based import Xpbd
 from experiments.benchmark.timing import Call
@@ -93,7 +94,7 @@ def every(
     for run in runs:
         network = trained.network(run)[0].peer.network
         if network in ("ncs", "snug"):
-            found = _peer(case, run, folder, shapes)
+            found = _baseline(case, run, folder, shapes)
         else:
             found = _psi(case, run, network or "psi", folder, shapes)
             found |= {} if network else _phi(case, run, descent_steps)
@@ -112,7 +113,7 @@ def _skinning(case: Case, folder: Path) -> Variant:
     g("Transpose", g.skinned(garment, "transforms", weights), perm=[0, 2, 1], name="vertices")
     g.save(path, {"transforms": (1, len(weights), 12)}, {"vertices": (1, weights.shape[1], 3)})
     tracks = [skinned_trajectory(experiment, case.character, windows(clip)) for clip in case.clips]
-    return Variant("skinning", "onnx", tracks, bound(path, peers.feed(path)))
+    return Variant("skinning", "onnx", tracks, bound(path, baselines.feed(path)))
 
 
 def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
@@ -177,22 +178,24 @@ def _loop(case: Case, config: Config, model: dict) -> Variant:
     return Variant("phi", "jax", tracks, None, float(np.median(us)))
 
 
-def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
+def _baseline(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
     folder = Path(tempfile.mkdtemp(dir=folder))
     experiment, character = case.experiment, case.character
     config, model = trained.network(run)
     network = config.peer.network
-    kept = psi.input_joints(experiment.names, config.stage2)
+    input_joints = psi.input_joints(experiment.names, config.stage2)
     weights, moving = _moving(experiment)
     free = ~np.asarray(experiment.scene.garment.pinned)
-    peer = peers.made(network, model["params"], np.asarray(character.template), weights, free)
+    baseline = baselines.assemble(network, model["params"], np.asarray(character.template), weights, free)
     constants = psi.constant_inputs(character.betas, character.material, config.material)
 
     @jax.jit
     def inputs(poses: Pose):
         def one(window):
-            seen = baselines.inputs(window, character.joints, constants, experiment.scene.body.parents, kept, config)
+            seen = baseline_inputs(
+                window, character.joints, constants, experiment.scene.body.parents, input_joints, config
+            )
             moved = skinning.joint_transforms(window.rotations[2], character.joints, experiment.scene.body.parents)
             rows = {name: x if name == "dynamic" else x[None] for name, x in seen.items()}
             return rows | {"transforms": moved[moving].reshape(1, -1, 12)}
@@ -203,25 +206,27 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
         seen = {name: np.asarray(x) for name, x in inputs(windows(clip)).items()}
         return [{name: x[t] for name, x in seen.items()} for t in range(len(clip.translation) - 2)]
 
-    coding = peers.write(folder / "codes.onnx", peer, whole=False)
+    coding = baselines.write(folder / "codes.onnx", baseline, skinned=False)
     try:
         usual = [assembly.motion(experiment, name) for name in specialise.CALIBRATION_CLIPS]
     except ValueError:  # for another body
         usual = case.clips
-    codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])
-    forms = {network: peer}
+    codes = np.concatenate([baselines.run(coding, frames(clip)) for clip in usual])
+    forms = {network: baseline}
     forms |= {
-        f"{network}, {name} of the shapes": peers.fewer(peer, codes, max(1, int(part * codes.shape[1])))
+        f"{network}, {name} of the shapes": baselines.fewer(baseline, codes, max(1, int(part * codes.shape[1])))
         for name, part in shapes.items()
     }
     variants, seen = {}, [frames(clip) for clip in case.clips]
     first = [skinned_trajectory(experiment, character, jax.tree.map(lambda x: x[:1], windows(c))) for c in case.clips]
     for name, form in forms.items():
         for int8 in (False, True):
-            path = peers.write(folder / f"{len(variants)}.onnx", form, int8=int8)
-            tracks = [np.concatenate([start, peers.run(path, of)[:-1]]) for start, of in zip(first, seen, strict=True)]
+            path = baselines.write(folder / f"{len(variants)}.onnx", form, int8=int8)
+            tracks = [
+                np.concatenate([start, baselines.run(path, of)[:-1]]) for start, of in zip(first, seen, strict=True)
+            ]
             label = f"{name}, int8" if int8 else name
-            variants[label] = Variant(network, "onnx", tracks, bound(path, peers.feed(path)))
+            variants[label] = Variant(network, "onnx", tracks, bound(path, baselines.feed(path)))
     return variants
 
 

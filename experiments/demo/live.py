@@ -198,12 +198,12 @@ class Show:
         if config.fps != self.player.clips.fps:
             raise ValueError(f"the clips are at {self.player.clips.fps} frames a second, {run} at {config.fps}")
         self._pose_body, body = _body(config.body)
-        whole = np.zeros(body.shapedirs.shape[-1])
+        all_betas = np.zeros(body.shapedirs.shape[-1])
         if betas is not None:
-            whole[: len(betas)] = betas[: len(whole)]
-        self.outfit = Outfit(run, whole, material, count, fine)
+            all_betas[: len(betas)] = betas[: len(all_betas)]
+        self.outfit = Outfit(run, all_betas, material, count, fine)
         self._shape = [
-            shaped(body, jnp.asarray(whole)) for shaped in (skinning.shaped_vertices, skinning.shaped_joints)
+            shaped(body, jnp.asarray(all_betas)) for shaped in (skinning.shaped_vertices, skinning.shaped_joints)
         ]
         self.body_faces = np.asarray(body.faces)
         self.past = deque(self.past, maxlen=max(3, BEHIND * (count - 1) + 1))

@@ -86,8 +86,8 @@ class Viewer:
             self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
             self.body = gui.add_checkbox("Body", True)
             self.wireframe = gui.add_checkbox("Wireframe", False)
-            told = f"strain: red from {STRAINED:.0%}; penetration: red from {1e3 * DEEP:.0f} mm inside the body"
-            self.points = gui.add_dropdown("Points", ("none", "strain", "penetration"), hint=told)
+            hint = f"strain: red from {STRAINED:.0%}; penetration: red from {1e3 * DEEP:.0f} mm inside the body"
+            self.points = gui.add_dropdown("Points", ("none", "strain", "penetration"), hint=hint)
             self.follow = gui.add_checkbox("Follow", True)
             self.pause = gui.add_checkbox("Pause", False)
             self._button("Single step", lambda: setattr(self, "_one_more", True))

@@ -159,11 +159,11 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
     character = characters.dress(
         scene, jnp.asarray(assembly.betas(config)), material.configured_material(config), config.physics
     )
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
+    windows = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
 
     @jax.jit
     def state(key):
-        window = characters.window(scene, character, motion_clips.poses(reel, jnp.int32(FRAME)))
+        window = characters.window(scene, character, motion_clips.poses(windows, jnp.int32(FRAME)))
         cloth = time_step.start(character, window, 0)
         shaken = 1e-3 * jax.random.normal(key, (2, *cloth.position.shape))
         cloth = cloth._replace(position=cloth.position + shaken[0])

@@ -69,21 +69,25 @@ def main(argv: list[str]) -> None:
     print(f"written to {arguments.out}: python -m http.server --directory {arguments.out}")
 
 
-def body(whole: Body, path: Path) -> dict:
+def body(rigged_body: Body, path: Path) -> dict:
     """Writes the mean body for GPU skinning, and tells where in the file its arrays are."""
-    weights = np.asarray(whole.weights)
+    weights = np.asarray(rigged_body.weights)
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
-    kept = np.take_along_axis(weights, bones, axis=1)
+    largest = np.take_along_axis(weights, bones, axis=1)
     arrays = {
-        "vertices": np.asarray(whole.vertices, "<f4"),
-        "weights": (kept / kept.sum(axis=1, keepdims=True)).astype("<f4"),
-        "faces": np.asarray(whole.faces, "<u4"),
+        "vertices": np.asarray(rigged_body.vertices, "<f4"),
+        "weights": (largest / largest.sum(axis=1, keepdims=True)).astype("<f4"),
+        "faces": np.asarray(rigged_body.faces, "<u4"),
         "bones": bones.astype("<u2"),
     }
     path.write_bytes(b"".join(array.tobytes() for array in arrays.values()))
     ends = np.cumsum([0, *(array.nbytes for array in arrays.values())])
     places = {name: [int(at), array.size] for (name, array), at in zip(arrays.items(), ends, strict=False)}
-    return {"body": places, "joints": np.asarray(whole.joints).tolist(), "parents": [int(p) for p in whole.parents]}
+    return {
+        "body": places,
+        "joints": np.asarray(rigged_body.joints).tolist(),
+        "parents": [int(p) for p in rigged_body.parents],
+    }
 
 
 def bundle(out: Path) -> None:
