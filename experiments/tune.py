@@ -1,11 +1,11 @@
-"""Fine-tunes Psi of a garment that comes with the library, or of a packed one, on motions or bodies of yours.
+"""Fine-tune Psi of a garment that comes with the library, or of a packed one, on your motions or bodies.
 
     python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000
 
-Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
-garment, for `clothjax.load` and all programs that take a run, with how it was made in report.json, and `tuning/`. Run
-again, it goes on where it stopped. A garment of the library is configured to be measured on motion capture too, which
-does not come with it: evaluate with `--motions walk_3`.
+Settings default to the garment's own configuration. It writes into the folder `tuning/` and a packed garment, for
+`clothjax.load` and all programs that take a run; report.json has the command and the hours. Run it again to go on where
+it stopped. A garment of the library is configured for evaluation on motion capture too, which does not come with it:
+evaluate with `--motions walk_3`.
 """
 
 import json

@@ -29,8 +29,9 @@ def to_onnx(
 ) -> Path:
     """Write one frame of a model as ONNX, and beside it a JSON that tells an engine how to drive it.
 
-    All inputs and outputs have a leading axis [N] of characters. Inputs are the state (`latent` [C] and `history`
-    [2, 12 J + 3] of the last two frames) and the pose to come (`rotations` [J, 3, 3] local, `translation` [3] m).
+    All inputs and outputs have a leading axis [N] of characters. The state is `latent` [C]
+    and `history` [2, 12 J + 3] of the last two frames, the pose to come `rotations` [J, 3, 3] local and `translation`
+    [3] m.
     Outputs are the next state (`next_latent`, `next_history`), `ok` (see `inference`) and `vertices`.
 
     Args:

@@ -1,6 +1,6 @@
 """NCS and SNUG's network (`clothjax/networks/baselines.py`) at inference: one frame as ONNX.
 
-They are spared what Psi does itself: features, and skinning transforms of the joints, come as inputs.
+Unlike Psi they get features, and skinning transforms of the joints, as inputs.
 """
 
 from pathlib import Path
@@ -33,7 +33,7 @@ class Baseline(NamedTuple):
 
 
 def published(vertices: int) -> Baseline:
-    """NCS at its published sizes, with random weights: it is timed, not looked at."""
+    """Build NCS at its published sizes, with random weights, to be timed."""
     config = Config(peer=PeerConfig("ncs"), stage1=Stage1Config(start_timestep=0.0))
     params = jax.jit(lambda k: baselines.init(k, JOINTS, 0, jnp.zeros((1, vertices, 3)), config))(jax.random.key(0))
     random = np.random.default_rng(0)
@@ -42,7 +42,7 @@ def published(vertices: int) -> Baseline:
 
 
 def assemble(network: str, params: Params, template: np.ndarray, weights: np.ndarray, free: np.ndarray) -> Baseline:
-    """A network with all its shapes; arguments as in `Baseline`."""
+    """Build a network with all its shapes; the arguments are fields of `Baseline`."""
     params = jax.tree.map(np.asarray, params)
     if network == "ncs":
         shapes = Layer(params["blendshapes"], np.zeros(params["blendshapes"].shape[1], np.float32))
@@ -52,15 +52,15 @@ def assemble(network: str, params: Params, template: np.ndarray, weights: np.nda
 
 
 def fewer(baseline: Baseline, codes: np.ndarray, count: int) -> Baseline:
-    """With so many shapes, the principal ones for codes [n, K] that occur: what Psi is given by `folding`."""
+    """Reduce a network to `count` shapes, the principal ones for codes [n, K], in the way of `specialise`."""
     mix, rows, moved = specialise.principal_rows(codes, baseline.shapes.kernel, count)
     return baseline._replace(mix=mix, shapes=Layer(rows, baseline.shapes.bias + moved))
 
 
 def write(path: Path, baseline: Baseline, *, int8: bool = False, skinned: bool = True) -> Path:
-    """Writes the graph; not `whole`: the network, without shapes and skinning.
+    """Write the graph; if not `skinned`, the network without shapes and skinning.
 
-    Its inputs are `hidden` [1, M], and of NCS `static` [1, S] and `dynamic` [J, 12], of SNUG `inputs` [1, N]; skinned,
+    Its inputs are `hidden` [1, M], for NCS `static` [1, S] and `dynamic` [J, 12], for SNUG `inputs` [1, N]; skinned,
     also `transforms` [1, J, 12]. Its outputs are `next_hidden`, and `vertices` [1, V, 3] or `code`.
     """
     g, params = Graph(int8), baseline.params
@@ -90,16 +90,16 @@ def write(path: Path, baseline: Baseline, *, int8: bool = False, skinned: bool =
 
 
 def feed(path: Path) -> dict[str, np.ndarray]:
-    """Random inputs of a graph."""
+    """Return random inputs of a graph."""
     random = np.random.default_rng(1)
     return {value.name: random.standard_normal(value.shape).astype(np.float32) for value in session(path).get_inputs()}
 
 
 def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Vertices [T, V, 3] m of an autoregressive rollout; of a graph that is not skinned, codes [T, K].
+    """Return vertices [T, V, 3] m of an autoregressive rollout; codes [T, K] of a graph that is not skinned.
 
     Args:
-        inputs: of each frame, but for `hidden`; what the graph does not read is left out.
+        inputs: of each frame, except `hidden`; entries that the graph does not read are ignored.
     """
     one, found = session(path), []
     read, last = {value.name for value in one.get_inputs()}, one.get_outputs()[-1].name
@@ -112,7 +112,7 @@ def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
 
 
 def _by_coordinate(baseline: Baseline) -> Layer:
-    """The layer that gives displacements [3 V], as one that gives the garment, all x first."""
+    """Turn a layer that gives displacements [3 V] into one that gives the garment, all x first."""
 
     def ordered(rows):
         rows = rows.reshape(*rows.shape[:-1], -1, 3) * baseline.free[:, None]
@@ -148,7 +148,7 @@ def _snug(g: Graph, units: list[Params]) -> str:
 
 
 def _gru(g: Graph, params: Params, x: str, state: str, name: str | None = None) -> str:
-    """A gated recurrent unit, as `baselines` has it."""
+    """Add a gated recurrent unit, the same as in `clothjax.networks.baselines`."""
     width = len(params["state"]["kernel"])
 
     def gates(layer: Params, x: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Error against time of all that can move a garment, what wins, and what is on the front."""
+"""Error against time of every method that moves a garment, with winners and Pareto fronts."""
 
 import tempfile
 from pathlib import Path
@@ -44,11 +44,11 @@ def measure(
     iterations: tuple[int, ...] = ITERATIONS,
     shapes: dict[str, float] = SHAPES,
 ) -> dict:
-    """Points of all runs, and what wins where a garment has runs of NCS beside runs of Psi.
+    """Measure the points of all runs, and find winners for garments with runs of both NCS and Psi.
 
     Args:
         runs: folders of runs and of packed models; those of one garment are compared with each other.
-        frames: of each motion; gaps: of them, at how many the solver is asked.
+        frames: of each motion; gaps: number of these at which the solver is asked.
         motions: default: those on which all runs of a garment are evaluated.
         descent_steps: of Phi; iterations: of the solver, of which the last is until it has converged.
         shapes: names of the forms of Psi and of baselines with fewer blend shapes, and the part of them that they have.
@@ -77,16 +77,15 @@ def measure(
 
 
 def _short(run: str) -> str:
-    """A run as it is called on every machine: a garment of the library by its name."""
+    """Return the name of a run that holds on every machine: a garment of the library by its name."""
     return Path(run).name if run and trained.packed(run) else run
 
 
 def wins(points: list[dict]) -> dict:
-    """Garments that have both, on which Psi beats NCS: in every error at no more time than NCS takes, and in time at
-    no more of any error.
+    """Find garments on which Psi beats NCS: in every error at no more time, and in time at no greater error.
 
     Both are in ONNX Runtime, and in forms of the same kinds: as trained, with fewer blend shapes, in eight bits. NCS is
-    taken in the fastest whose errors are at most USABLE times those of the form that was trained. Of several runs
+    represented by its fastest form with errors at most USABLE times those of the trained form. Of several runs
     (seeds) the medians of a form are compared.
     """
     won = {"wins_at_equal_time": [], "wins_at_equal_error": [], "compared": []}
@@ -113,7 +112,7 @@ def wins(points: list[dict]) -> dict:
 
 
 def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
-    """Time and errors of each form, by name, over the runs that have it."""
+    """Return median time and errors of each form, by name, over the runs that have it."""
     names = dict.fromkeys(p["name"] for p in points)
     return {
         name: {key: float(np.median([p[key] for p in points if p["name"] == name])) for key in ("us", *ERRORS)}
@@ -122,7 +121,7 @@ def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
 
 
 def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
-    """The `points` that two reports share, and Kendall's tau of their order by time and by each error."""
+    """Return the number of `points` that two reports share, and Kendall's tau of their orders by time and error."""
     named = {(p["garment"], p["run"], p["name"]): p for p in others}
     pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
     found = {"points": len(pairs)}
@@ -133,7 +132,7 @@ def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
 
 
 def _better(one: dict, other: dict, error: str) -> bool:
-    """True for a point that is no worse in time and error, and better in one."""
+    """Return whether a point is no worse in time and error, and better in one."""
     no_worse = one["us"] <= other["us"] and one[error] <= other[error]
     return no_worse and (one["us"], one[error]) != (other["us"], other[error])
 
@@ -160,9 +159,9 @@ def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps
 
 
 def plot(report: dict, path: Path | BinaryIO) -> None:
-    """Each error against time, a row for each garment, with the fronts.
+    """Plot each error against time, a row for each garment, with the fronts.
 
-    What is beyond the plot's ends is drawn at them.
+    Points beyond the plot's ends are drawn at them.
     """
     points = report["points"]
     garments = list(dict.fromkeys(point["garment"] for point in points))

@@ -1,4 +1,4 @@
-"""Rollouts by each thing that moves a garment: Psi and Phi in their variants, baselines, the solver, XPBD, skinning."""
+"""Rollouts by every method that moves a garment: variants of Psi and Phi, baselines, the solver, XPBD, skinning."""
 
 import dataclasses
 import tempfile
@@ -39,7 +39,7 @@ ALIKE = ("body", "fps", "physics", "material", "motions")  # of the configuratio
 
 
 class Variant(NamedTuple):
-    """Something that moves a garment."""
+    """A method that moves a garment, with its rollouts."""
 
     family: str  # such as psi, ncs or solver
     runtime: str  # onnx, c, jax or warp
@@ -50,7 +50,7 @@ class Variant(NamedTuple):
 
 
 class Case(NamedTuple):
-    """The common ground of the variants of a garment."""
+    """The experiment, character and motions that the variants of a garment share."""
 
     experiment: Experiment
     character: Character
@@ -58,7 +58,7 @@ class Case(NamedTuple):
 
 
 def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
-    """The common ground of runs of a garment: the character and the motions of the first one's evaluation."""
+    """Prepare the case of a garment's runs: the character and the motions of the first run's evaluation."""
     configs = [trained.network(run)[0] for run in runs]
     first = configs[0]
     wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
@@ -89,7 +89,7 @@ def every(
     iterations: tuple[int, ...],
     shapes: dict[str, float],
 ) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
-    """The variants of one garment by run and name, and the solver's own loops."""
+    """Return the variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
         network = trained.network(run)[0].peer.network
@@ -117,10 +117,10 @@ def _skinning(case: Case, folder: Path) -> Variant:
 
 
 def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
-    """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
+    """Return Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
 
-    In ONNX Runtime it is timed as baselines are, with pose inputs and skinning transforms given; and, as in C, from the
-    pose, which no baseline does.
+    In ONNX Runtime it is timed twice: with pose inputs and skinning transforms given, like a baseline, and from the
+    pose, like in C.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
     model = inference.load(run, betas=np.asarray(case.character.betas))
@@ -147,14 +147,14 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
 
 
 def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
-    """As `evaluate.psi_trajectory`, of what gives vertices [T, V, 3] m of a motion."""
+    """Return trajectories like `psi_trajectory`, from a function that gives vertices [T, V, 3] m of a motion."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
     local = part._replace(translation=(part.translation - part.translation[:1]).astype(np.float32))
     return run(local) - local.translation[:, None]
 
 
 def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Variant]:
-    """Phi with more and fewer steps of its descent, in jax."""
+    """Return Phi with more and fewer steps of its descent, in jax."""
     config, model = trained.phi(run)
     case = case._replace(experiment=assembly.assemble(config))  # with the graph that it was trained on
     if config.model.latent_update != "descent":
@@ -166,7 +166,7 @@ def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Var
 
 
 def _loop(case: Case, config: Config, model: dict) -> Variant:
-    """Phi's rollout in jax, timed as a whole."""
+    """Return Phi's rollout in jax, timed in one piece."""
     experiment, tracks, us = case.experiment._replace(config=config), [], []
     run = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, experiment, c, p))
     for clip in case.clips:
@@ -179,7 +179,7 @@ def _loop(case: Case, config: Config, model: dict) -> Variant:
 
 
 def _baseline(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
-    """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
+    """Return NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
     folder = Path(tempfile.mkdtemp(dir=folder))
     experiment, character = case.experiment, case.character
     config, model = trained.network(run)
@@ -231,7 +231,7 @@ def _baseline(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> 
 
 
 def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], list[np.ndarray]]:
-    """The reference solver, stopped after some iterations; and its loops when it is not."""
+    """Return the reference solver stopped after some iterations, and its complete loops."""
     experiment, variants, solved = case.experiment, {}, []
     for iterations in limits:
         tracks, us, converged = [], [], []
@@ -256,7 +256,7 @@ def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], li
 
 
 def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
-    """XPBD, from where the solver starts; nothing where Newton is not installed."""
+    """Return XPBD from the solver's start; nothing if Newton is not installed."""
     variants, experiment = {}, case.experiment
     for substeps, iterations in XPBD:
         try:
@@ -275,7 +275,7 @@ def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
 
 
 def _moving(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
-    """Skinning weights [J', V] of the joints that move the garment, and their indices."""
+    """Return skinning weights [J', V] of the joints that move the garment, and their indices."""
     weights = np.asarray(experiment.scene.garment.weights, np.float32)
     moving = np.flatnonzero(weights.max(axis=0) > 0)
     return weights[:, moving].T, moving

@@ -1,4 +1,4 @@
-"""Builds a page that plays garments in the browser alone: no Python, and nothing but a file server, behind it.
+"""Build a page that plays garments in the browser alone, with only a file server and no Python behind it.
 
     python -m experiments.web.build --out site
     python -m experiments.web.build skirt runs/mine --motions walk_3 dance_3 --out site
@@ -70,7 +70,7 @@ def main(argv: list[str]) -> None:
 
 
 def body(rigged_body: Body, path: Path) -> dict:
-    """Writes the mean body for GPU skinning, and tells where in the file its arrays are."""
+    """Write the mean body for GPU skinning; return the places of its arrays in the file."""
     weights = np.asarray(rigged_body.weights)
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
     largest = np.take_along_axis(weights, bones, axis=1)
@@ -91,7 +91,7 @@ def body(rigged_body: Body, path: Path) -> dict:
 
 
 def bundle(out: Path) -> None:
-    """The page's program with its libraries, by esbuild."""
+    """Bundle the page's program with its libraries, by esbuild."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder) / "web"
         work.mkdir()
