@@ -1,4 +1,4 @@
-"""The work around every program: arguments in one spelling, compilation cache, one clear line for a user's mistake."""
+"""The frame of every program: arguments in one spelling, compilation cache, one clear line for a user's mistake."""
 
 import argparse
 import contextlib
@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 Arguments = TypeVar("Arguments")
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -20,10 +20,10 @@ RENAMED = {"--motion": "--motions"}  # flags by their old spelling; an underscor
 
 
 class Parser(argparse.ArgumentParser):
-    """A program's arguments: no abbreviations, `--help` shows the examples, an old spelling gets a clear error.
+    """Parser of a program's arguments: no abbreviations, examples in `--help`, a clear error for an old spelling.
 
     Args:
-        program: as it is typed after `python -m`.
+        program: its name after `python -m`.
         about: the docstring with the examples.
         settings: whether settings of a configuration may follow, as `--stage1.steps 20`.
     """
@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def model_argument(parser: Parser, nargs: str | None = None, default: Any = None, about: str = "") -> None:
-    """Adds the positional argument `model`, as text for `model_folder`."""
+    """Add the positional argument `model`, as text for `model_folder`."""
     parser.takes_model = True
     parser.add_argument(
         "model",
@@ -54,7 +54,7 @@ def model_argument(parser: Parser, nargs: str | None = None, default: Any = None
 
 
 def model_folder(text: str | Path) -> Path:
-    """The folder of a model: of a run, of a packed model, or of a garment that comes with clothjax, by its name.
+    """Return the folder of a model: a run, a packed model, or a garment that comes with clothjax by its name.
 
     Raises:
         ValueError: if there is no such folder and no such garment.
@@ -67,12 +67,12 @@ def model_folder(text: str | Path) -> Path:
 def refuse_old_spellings(
     argv: Sequence[str], known: Collection[str], takes_model: bool = False, settings: bool = False
 ) -> None:
-    """Names the new spelling of the first flag that has an old one.
+    """Refuse old spellings of flags, with the new one in the error.
 
     Args:
         known: the flags of the program.
-        takes_model: whether it takes a model.
-        settings: whether it takes settings of a configuration, of which `--garment` and `--motions` are two.
+        takes_model: whether the program takes a model.
+        settings: whether it takes settings of a configuration, such as `--garment` and `--motions`.
 
     Raises:
         ValueError: for an old spelling.
@@ -88,32 +88,33 @@ def refuse_old_spellings(
             raise ValueError(f"{flag} is no longer there: {MODEL} is written without a flag, as `skirt` or `runs/mine`")
 
 
-def arguments(kind: type[Arguments], program: str, about: str, argv: Sequence[str] | None = None) -> Arguments:
-    """A dataclass of arguments from the command line, as `Parser` reads them.
+def arguments(kind: type[Arguments], program: str, about: str | None, argv: Sequence[str] | None = None) -> Arguments:
+    """Fill a dataclass of arguments from the command line, with the spelling of `Parser`.
 
     Args:
-        kind: the dataclass; program, about: as of `Parser`.
-        argv: default: those of this process.
+        kind: the dataclass.
+        program, about: the same as for `Parser`.
+        argv: default the arguments of this process.
     """
     import tyro
 
     argv = sys.argv[1:] if argv is None else argv
-    fields = dataclasses.fields(kind)  # pyright: ignore[reportArgumentType]  # a TypeVar cannot say dataclass
-    refuse_old_spellings(argv, [f"--{field.name.replace('_', '-')}" for field in fields])
+    names = [field.name for field in dataclasses.fields(cast(Any, kind))]
+    refuse_old_spellings(argv, [f"--{name.replace('_', '-')}" for name in names])
     if {"-h", "--help"} & set(argv):
-        print(about)  # as it is: tyro would fold its lines
+        print(about)  # unchanged: tyro would fold its lines
     return tyro.cli(kind, args=list(argv), prog=f"python -m {program}")
 
 
 def run(main: Callable[[list[str]], None]) -> None:
-    """A program from its arguments to its exit code."""
+    """Run a program: from its arguments to its exit code."""
     setup()
     with fail_clearly():
         main(sys.argv[1:])
 
 
 def setup() -> None:
-    """Keeps compiled programs between runs, in `.jax_cache` or where JAX_COMPILATION_CACHE_DIR says."""
+    """Store compiled programs between runs, in `.jax_cache` or the folder JAX_COMPILATION_CACHE_DIR."""
     import jax
 
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
@@ -122,7 +123,7 @@ def setup() -> None:
 
 @contextlib.contextmanager
 def fail_clearly() -> Iterator[None]:
-    """Ends the program with one line and exit code 1 on a mistake of the user's or a training that diverged."""
+    """End the program with one line and exit code 1 on a user's mistake or a diverged training."""
     try:
         yield
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
@@ -132,6 +133,6 @@ def fail_clearly() -> Iterator[None]:
         hint = (
             "; make room, and run the same command again: a training goes on from its last checkpoint" if full else ""
         )
-        logging.getLogger("asyncio").disabled = True  # what Orbax left would be said after what matters
+        logging.getLogger("asyncio").disabled = True  # its lines about tasks that Orbax left would hide the error
         print(f"error: {error}{hint}", file=sys.stderr)
         raise SystemExit(1) from None

@@ -1,8 +1,8 @@
-"""Writes Psi for another runtime: the same program as `python -m clothjax convert`.
+"""Write Psi for another runtime: the same program as `python -m clothjax convert`.
 
     python -m experiments.convert skirt --to onnx --int8
 
-`clothjax/commands/convert.py` tells the rest.
+See `clothjax/commands/convert.py`.
 """
 
 from clothjax import cli

@@ -1,8 +1,8 @@
-"""Measures runs and garments against the reference solver: the same program as `python -m clothjax evaluate`.
+"""Measure runs and garments against the reference solver: the same program as `python -m clothjax evaluate`.
 
     python -m experiments.evaluate runs/quickstart --motions walk_3
 
-`clothjax/commands/evaluate.py` tells the rest.
+See `clothjax/commands/evaluate.py`.
 """
 
 from clothjax import cli

@@ -1,9 +1,9 @@
-"""A picture of a garment: Phi, Psi and the reference solver, each in its own rollout, on three motions and bodies.
+"""Draw a garment: Phi, Psi and the reference solver, each in its own rollout, on three motions and bodies.
 
     python -m experiments.gallery skirt --out skirt.png
     python -m experiments.gallery runs/skirt --motions walk_3 dance_3 run_3 --frame 45 --out skirt.png
 
-The bodies are a thin, the mean and a heavy one, the cloth is the middling one of `assembly.wearers`. Rollouts begin
+The bodies are a thin, the mean and a heavy one, the cloth is the middle one of `assembly.wearers`. Rollouts begin
 at the motion's start; the same frame of each is shown.
 """
 

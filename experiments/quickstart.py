@@ -1,9 +1,9 @@
-"""From nothing to a garment moving on a body: trains, measures, draws and exports the embedded t-shirt.
+"""Train, measure, draw and export the embedded t-shirt: from nothing to a garment moving on a body.
 
-    python -m experiments.quickstart                      # what `make quickstart` runs
+    python -m experiments.quickstart                      # the same as `make quickstart`
     python -m experiments.quickstart --stage1.steps 400   # any setting may be changed
 
-It leaves in `runs/quickstart/`: the checkpoints of both stages, report.json, report.md, comparison.png, walk.webp,
+It writes into `runs/quickstart/`: the checkpoints of both stages, report.json, report.md, comparison.png, walk.webp,
 tshirt.onnx (with tshirt.json, how to drive it) and tshirt.glb. Run again, it goes on where it stopped.
 """
 
@@ -80,7 +80,7 @@ def main(argv: list[str]) -> None:
 
 
 def readable(report: dict, config: Config) -> str:
-    """The report for a reader."""
+    """Return the report as readable text."""
     figures = report["quickstart"]
     return f"""# Quickstart report
 

@@ -1,8 +1,8 @@
-"""Draws pictures and animations of a trained garment: the same program as `python -m clothjax render`.
+"""Draw pictures and animations of a trained garment: the same program as `python -m clothjax render`.
 
     python -m experiments.render skirt --motions dance_3 --out skirt.mp4
 
-`clothjax/commands/render.py` tells the rest.
+See `clothjax/commands/render.py`.
 """
 
 from clothjax import cli

@@ -1,13 +1,13 @@
-"""Takes the steps of a training that diverged once more, one at a time, and says what the first bad one was made of.
+"""Repeat the steps of a training that diverged, one at a time, and describe the first bad one.
 
     python -m experiments.replay runs/mine                   # its last stage
     python -m experiments.replay runs/mine --stage stage1
     python -m experiments.replay runs/mine --allowed 0       # the first step that was skipped, though training went on
 
-It starts from the last good checkpoint and goes on until training would stop. Named are the terms that are not finite,
-and of each simulation of the batch its clip, frame, betas and material. The state before that step is kept in
-`RUN/<stage>/diverged/`, from where the next replay starts. Nothing else of the run is touched. Steps are compiled one
-by one here, and twenty together in training: what is at the edge of diverging may not do so again.
+It starts from the last good checkpoint and goes on until training would stop. It names the terms that are not finite,
+and the clip, frame, betas and material of each simulation in the batch. The state before that step is saved in
+`RUN/<stage>/diverged/`, where the next replay starts. Nothing else of the run is touched. Steps are compiled one by one
+here, and twenty together in training: a run at the edge of diverging may not do so again.
 """
 
 from collections.abc import Callable
@@ -49,24 +49,24 @@ def main(argv: list[str]) -> None:
 
 
 def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
-    """A description of the first step from which on more in a row than `allowed` were not finite.
+    """Describe the first step of the run of non-finite steps, more than `allowed`, that stopped training.
 
     Raises:
         ValueError: if the stage has finished.
     """
-    start, found = _start(run / stage)
-    config = configuration.from_dict(Config, found.config, str(start))
+    start, source = _start(run / stage)
+    config = configuration.from_dict(Config, source.config, str(start))
     total = getattr(config, stage).steps
-    if found.step >= total:
+    if source.step >= total:
         raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")
     experiment = assembly.assemble(config)
     clips, _ = assembly.training_clips(experiment)
-    update, turn, state = _again(run, stage, experiment, clips)
+    update, starting, state = _again(run, stage, experiment, clips)
     state, _ = checkpoint.restore(start, state)
-    print(f"from step {found.step} of {start}", flush=True)
-    end, skipped = min(found.step + steps, total), 0
-    with progress_bar("replaying", end - found.step) as report:
-        for step in range(found.step, end):
+    print(f"from step {source.step} of {start}", flush=True)
+    end, skipped = min(source.step + steps, total), 0
+    with progress_bar("replaying", end - source.step) as report:
+        for step in range(source.step, end):
             before = jax.device_get(state)
             state, metrics = update(state)
             metrics = {name: np.asarray(values) for name, values in metrics.items()}
@@ -76,65 +76,65 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
                 skipped = loop.check_finite(metrics, step, skipped, allowed)
             except FloatingPointError as error:
                 step, before, metrics = first
-                kept = run / stage / "diverged" / str(step)
-                if not kept.is_dir():
-                    checkpoint.save(kept.parent, step, before, found.config)
-                return f"{error}\n{_said(step, metrics, turn(before), experiment)}\nkept: {kept}"
-            report(step + 1 - found.step)
-    return f"steps {found.step + 1} to {end} of {total} do not diverge; --steps takes more of them"
+                folder = run / stage / "diverged" / str(step)
+                if not folder.is_dir():
+                    checkpoint.save(folder.parent, step, before, source.config)
+                return f"{error}\n{_description(step, metrics, starting(before), experiment)}\nkept: {folder}"
+            report(step + 1 - source.step)
+    return f"steps {source.step + 1} to {end} of {total} do not diverge; --steps takes more of them"
 
 
 def _start(folder: Path) -> tuple[Path, checkpoint.Checkpoint]:
-    """Return the state to start from: that of an earlier replay, if it is of this training and later."""
-    usual, kept = folder / "checkpoints", folder / "diverged"
-    found = checkpoint.latest(usual)
-    if checkpoint.steps(kept):
-        before = checkpoint.latest(kept)
-        if before.step >= found.step and before.config == found.config:
-            return kept, before
-    return usual, found
+    """Return the checkpoint to start from: one that an earlier replay saved, if it is later and of this training."""
+    regular, diverged = folder / "checkpoints", folder / "diverged"
+    latest = checkpoint.latest(regular)
+    if checkpoint.steps(diverged):
+        saved = checkpoint.latest(diverged)
+        if saved.step >= latest.step and saved.config == latest.config:
+            return diverged, saved
+    return regular, latest
 
 
 def _again(
     run: Path, stage: str, experiment: assembly.Experiment, clips: Clips
 ) -> tuple[Callable, Callable, stage1.TrainingState]:
-    """The training step of a stage, what tells the simulations of a step, and a state."""
+    """Return the training step of a stage, the function that finds the simulations of a step, and a state."""
     config = experiment.config
-    kept = psi.input_joints(experiment.names, config.stage2)
+    input_joints = psi.input_joints(experiment.names, config.stage2)
     if stage == "tuning":
-        psi_of_run = trained.psi(run)
+        student = trained.psi(run)
         phi = trained.phi(run)[1]["params"]
         animator = animators.psi_animator(
-            psi_of_run.garment,
-            psi_of_run.normalizers,
-            kept,
-            fine_tuning.preconditioners(experiment, clips, phi, psi_of_run.normalizers, kept),
+            student.garment,
+            student.normalizers,
+            input_joints,
+            fine_tuning.preconditioners(experiment, clips, phi, student.normalizers, input_joints),
         )
         config = fine_tuning.settings(config)
-        state = fine_tuning.init(psi_of_run.predictor, experiment.scene, clips, experiment.config)
+        state = fine_tuning.init(student.predictor, experiment.scene, clips, experiment.config)
     elif config.peer.network:
-        animator = animators.baseline_animator(kept)
-        state = stage1.init_baseline(
-            experiment.scene, clips, kept, laplacian_shapes.laplacian(experiment.scene, config), config
+        animator = animators.baseline_animator(input_joints)
+        state = stage1.init_peer(
+            experiment.scene, clips, input_joints, laplacian_shapes.laplacian(experiment.scene, config), config
         )
     else:
         animator, state = animators.phi_animator, stage1.init(experiment.scene, clips, config)
 
     @partial(jax.jit, static_argnums=2)
-    def turn(state: stage1.TrainingState, clips: Clips, frames: int):
-        return stage1.next_batch(state, experiment.scene, clips, frames, config)
+    def starting(state: stage1.TrainingState, clips: Clips, frames: int):
+        return stage1.turn(state, experiment.scene, clips, frames, config)
 
     update = stage1.make_curriculum(experiment.scene, clips, config, 1, None, animator)
-    return update, lambda state: turn(state, clips, stage1.rollout_length(int(state.step), config)), state
+    return update, lambda state: starting(state, clips, stage1.rollout_length(int(state.step), config)), state
 
 
-def _said(
+def _description(
     step: int,
     metrics: loop.Metrics,
     simulations: tuple[np.ndarray, pool.Simulation],
     experiment: assembly.Experiment,
 ) -> str:
-    """A bad step for a reader."""
+    """Describe a bad step for a reader."""
     wrong = [name for name, values in metrics.items() if not np.isfinite(values[0])]
     lines = [f"step {step + 1}: not finite: {', '.join(wrong)}"]
     clips = {

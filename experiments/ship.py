@@ -1,10 +1,10 @@
-"""Packs a finished run as a garment that comes with the library, with what was measured of it.
+"""Pack a finished run as a garment that comes with the library, with its measures.
 
     python -m experiments.ship runs/skirt skirt
 
-It leaves `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json, the measures of the packed model on
-the validation motions, with the command that trained it and its hours. A folder that `experiments.tune` left is packed
-already; of a garment that is there by that name only the report is made anew.
+It writes `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json. The report has the measures of the
+packed model on the validation motions, the command that trained it and its hours. A folder from `experiments.tune` is
+already packed. If the library has a garment of that name, only its report is written again.
 """
 
 import json
@@ -23,7 +23,7 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     run, folder = cli.model_folder(arguments.model), trained.MODELS / arguments.name
     if trained.packed(run):
-        packed, about = run, trained.made(run)
+        packed, about = run, trained.provenance(run)
     else:
         packed = run / "packed" / arguments.name
         size = trained.pack(run, packed)
@@ -31,7 +31,7 @@ def main(argv: list[str]) -> None:
         config, _ = trained.phi(packed)
         seconds = sum(sum(read_seconds(run / stage)) for stage in trained.STAGES) + sum(add_seconds(run).values())
         about = {
-            # the configuration is whole: it trains the same again
+            # the configuration is complete: it trains the same again
             "command": f"python -m experiments.train clothjax/assets/models/{arguments.name}/{trained.CONFIG}",
             "seed": config.stage1.seed,
             "hours": seconds / 3600,

@@ -1,12 +1,12 @@
-"""Trains and measures an experiment for several garments and seeds, each a job of its own.
+"""Train and measure an experiment for several garments and seeds, each in its own job.
 
     python -m experiments.sweep configs/quickstart.yaml --garments tshirt_1000 dress_1000 --seeds 0 1 --directory runs/s
     python -m experiments.sweep configs/quickstart.yaml --seeds 0 1 2 --stage1.steps 20000        # settings for all
     python -m experiments.sweep configs/paper_tshirt.yaml --seeds 0 1 2 --slurm partition=gpu gpus_per_node=1 time=2000
 
 Jobs run on this machine, `--at-once` of them at a time or one on each of `--gpus`, or with `--slurm` on a cluster. Each
-leaves a run folder `<garment>_<seed>`; the sweep leaves `sweep.json` and prints a table. Run it again to go on: jobs
-that were stopped, or requeued by the cluster, resume from their checkpoints; finished ones are not done again.
+writes a run folder `<garment>_<seed>`; the sweep writes `sweep.json` and prints a table. Run it again to go on: jobs
+that were stopped, or requeued by the cluster, resume from their checkpoints, and finished ones are skipped.
 """
 
 import argparse
@@ -30,7 +30,7 @@ COLUMNS = ("energy_gap", "hold_gap", "penetration_percent", "jitter", "ms_per_fr
 
 
 class Job(submitit.helpers.Checkpointable):
-    """One training and its evaluation. A cluster that takes its machine away submits it again, and it resumes."""
+    """One training and its evaluation. A job that a cluster preempts is submitted again, and resumes."""
 
     def __call__(self, arguments: list[str], directory: str) -> dict:
         cli.setup()
@@ -87,7 +87,7 @@ def main(argv: list[str]) -> None:
 
 
 def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, dict], dict[str, str]]:
-    """The reports of the jobs that finished, and why the others did not."""
+    """Return the reports of the finished jobs, and the reasons why the others failed."""
     finished, failed = {}, {}
     slots = queue.SimpleQueue()  # places for a job: the GPU it has there, if any
     places = [None] * len(jobs) if chosen.slurm is not None else chosen.gpus or [None] * chosen.at_once
@@ -116,10 +116,10 @@ def _run(jobs: dict[str, tuple], chosen: argparse.Namespace) -> tuple[dict[str, 
 
 
 def _reason(error: Exception) -> str:
-    """The line of a job's traceback that says what went wrong; else the last line there is."""
+    """Return the line of a job's traceback that names the error; else its last line."""
     lines = [line.strip() for line in str(error).strip().splitlines()]
-    said = [line for line in lines if re.match(r"[\w.]+(Error|Exit|Interrupt)\b", line)]
-    return (said or lines or [type(error).__name__])[-1]
+    causes = [line for line in lines if re.match(r"[\w.]+(Error|Exit|Interrupt)\b", line)]
+    return (causes or lines or [type(error).__name__])[-1]
 
 
 def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
@@ -140,7 +140,7 @@ def _executor(chosen: argparse.Namespace, gpu: int | None) -> submitit.Executor:
 
 
 def table(summary: dict[str, dict]) -> str:
-    """The figures of every job's Psi, or of its baseline, as Markdown."""
+    """Return the figures of every job's Psi, or of its baseline, as Markdown."""
     rows = ["| | " + " | ".join(COLUMNS) + " |", "|---" * (1 + len(COLUMNS)) + "|"]
     for name, stages in summary.items():
         last = list(stages.values())[-1]

@@ -1,14 +1,14 @@
-"""The thesis's table and figures, made again with this library: trains what is missing, measures it and draws it.
+"""Reproduce the thesis's table and figures with this library: train the missing runs, measure them and draw them.
 
     python -m experiments.thesis                        # five garments, ours and NCS: an hour each on two cores
     python -m experiments.thesis --garments tshirt
-    python -m experiments.thesis --garments tshirt --no-training    # of the runs that are there
+    python -m experiments.thesis --garments tshirt --no-training    # of the present runs
 
-It leaves in `runs/thesis/` the runs, `<garment>/{ours,ncs}` and `tshirt/direct`, and `report.html`, one file with all
-pictures, beside `report.json`. Stopped and started again, training goes on where it was.
+It writes into `runs/thesis/` the runs, `<garment>/{ours,ncs}` and `tshirt/direct`, and `report.html`, one file with
+all pictures, beside `report.json`. Stopped and started again, training goes on where it stopped.
 
 Ours (`configs/thesis.yaml`) and NCS (`configs/ncs.yaml`) have the same garment, body, motions, losses and time. Figures
-have the numbers that they have in the thesis.
+are numbered as in the thesis.
 """
 
 import base64
@@ -94,7 +94,7 @@ def main(argv: list[str]) -> None:
 
 
 def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
-    """Finished runs of a garment, by network; trained first where they are missing."""
+    """Return finished runs of a garment, by network; train missing ones first."""
     wanted = [key for key in CONFIGS if key != "direct" or name == ABLATION]
     found = {}
     for key in wanted:
@@ -112,7 +112,7 @@ def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
 
 
 def cloth(name: str, folder: Path) -> str:
-    """The embedded garment of a name, or a file made from the template of that name."""
+    """Return the embedded garment of a name, or the file built from the template of that name."""
     embedded = f"{name}_{VERTICES}"
     if embedded in storage.asset_names("garment"):
         return embedded
@@ -124,7 +124,7 @@ def cloth(name: str, folder: Path) -> str:
 
 
 def finished(run: Path, config: Config | None = None) -> bool:
-    """True where the last stage of a run is at its last step.
+    """Return whether the last stage of a run is at its last step.
 
     Raises:
         ValueError: if it was trained with another configuration than this.
@@ -146,7 +146,7 @@ def finished(run: Path, config: Config | None = None) -> bool:
 
 @functools.cache
 def measures(run: Path) -> dict[str, dict[str, float]]:
-    """The measures of each stage of a run, as of `clothjax evaluate`."""
+    """Return the measures of each stage of a run, the same as `clothjax evaluate`."""
     return evaluate(run)["evaluation"]
 
 
@@ -157,7 +157,7 @@ Runs = dict[str, dict[str, Path]]  # by garment and network
 
 
 def appearance(runs: Runs) -> tuple[dict, Section]:
-    """Figure 5: Phi, Psi and NCS beside the solver."""
+    """Draw figure 5: Phi, Psi and NCS beside the solver."""
     figures, parts = {}, []
     for garment, of_it in runs.items():
         figures[garment], tracks = {}, {}
@@ -169,9 +169,9 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
             figures[garment] |= {name: values for name, values in measured.items() if name != "lbs"}
             config = trained.network(run)[0]
             motion = config.evaluation.motions[0]
-            kept = Tracks.load(run, motion)
-            tracks |= {name: track for name, track in kept.stages.items() if name != "lbs"}
-            solver = kept.solver
+            saved = Tracks.load(run, motion)
+            tracks |= {name: track for name, track in saved.stages.items() if name != "lbs"}
+            solver = saved.solver
         experiment = assembly.assemble(config)
         rows, columns = pictures.at_moments(experiment, motion, tracks | {"solver": solver}, MOMENTS)
         parts.append(f"<h3>{garment}</h3>" + table(figures[garment]) + sheet(rows, columns))
@@ -183,7 +183,7 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
 
 
 def shapes(runs: Runs) -> tuple[dict, Section]:
-    """Figure 6: a thin, the mean and a heavy body."""
+    """Draw figure 6: a thin, the mean and a heavy body."""
     parts = []
     for garment, of_it in runs.items():
         if "ours" in of_it:
@@ -196,7 +196,7 @@ def shapes(runs: Runs) -> tuple[dict, Section]:
 
 
 def ablation(runs: Runs) -> tuple[dict, Section]:
-    """Figure 7: Psi trained directly on the physics, without stage 1."""
+    """Draw figure 7: Psi trained directly on the physics, without stage 1."""
     of_it, title = runs.get(ABLATION, {}), "Figure 7: without stage 1"
     if not {"ours", "direct"} <= set(of_it):
         return {}, (title, f"<p>Needs both runs of the {ABLATION}.</p>")
@@ -205,15 +205,15 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
         figures[stage] = measures(of_it[key])[stage]
         config = trained.network(of_it[key])[0]
         motion = config.evaluation.motions[0]
-        kept = Tracks.load(of_it[key], motion)
-        tracks |= {stage: kept.stages[stage], "solver": kept.solver}
+        saved = Tracks.load(of_it[key], motion)
+        tracks |= {stage: saved.stages[stage], "solver": saved.solver}
     rows, columns = pictures.at_moments(assembly.assemble(config), motion, tracks, MOMENTS)
     text = "<p>Predictor, decoder and blend shapes trained on the losses alone, for the same time.</p>"
     return figures, (title, text + table(figures) + sheet(rows, columns))
 
 
 def failure(runs: Runs) -> tuple[dict, Section]:
-    """Figure 9: a code that went wrong feeds back; what brings it back."""
+    """Draw figure 9: a wrong code feeds back, and the ways that it recovers."""
     garment = LOOSE if "ours" in runs.get(LOOSE, {}) else next((g for g in runs if "ours" in runs[g]), None)
     title = "Figure 9: a failure, and its mend"
     if garment is None:
@@ -257,14 +257,14 @@ def failure(runs: Runs) -> tuple[dict, Section]:
         "<p>In the thesis, cloth that has gone into the body spoils the code, and the code all that follows. Here the "
         f"code before frame 0 is replaced by one {FARNESS:.0f} standard deviations off. What brings it back: codes are "
         "held to the range of training, a tenth of them is forgotten in a frame, and Psi was trained from noisy codes. "
-        "What keeps it from happening: edges are kept out of the body, not vertices alone.</p>"
+        "Contact of edges, not of vertices alone, prevents it.</p>"
     )
     columns = [f"frame {t - BROKEN}" for t in moments]
     return {"garment": garment, **figures}, (title, text + image(figure) + sheet(rows, columns))
 
 
 def _recovery(values: np.ndarray) -> int | None:
-    """Frames after the code was broken until distances [T] mm are below 1 for good; None if they are not at the end."""
+    """Return frames from the broken code until distances [T] mm stay below 1; None if they do not."""
     away = np.flatnonzero(values > 1.0)
     if len(away) == 0:
         return 0
@@ -272,7 +272,7 @@ def _recovery(values: np.ndarray) -> int | None:
 
 
 def broken(model: Model, poses: Pose, deviations: float) -> np.ndarray:
-    """Vertices [T, V, 3] m in the world over a clip, with the code of one frame replaced by one so far off; 0: not."""
+    """Return vertices [T, V, 3] m in the world over a clip, with the code of one frame moved that far; 0 for not."""
     state, found = inference.initial_state(model, jax.tree.map(lambda x: x[0], poses)), []
     wrong = deviations * jax.random.normal(jax.random.key(0), state.latent.shape)
     for frame in range(min(len(poses.translation), BROKEN + AFTER)):
@@ -284,7 +284,7 @@ def broken(model: Model, poses: Pose, deviations: float) -> np.ndarray:
 
 
 def times(runs: Runs) -> tuple[dict, Section]:
-    """The run-time table, and error against time."""
+    """Draw the run-time table, and error against time."""
     figures = pareto.measure([run for of_it in runs.values() for run in of_it.values()], **PARETO)
     buffer = io.BytesIO()
     pareto.plot(figures, buffer)
@@ -303,13 +303,13 @@ def times(runs: Runs) -> tuple[dict, Section]:
 
 
 def inputs(runs: Runs) -> tuple[dict, Section]:
-    """Return the count of numbers that each network reads in a frame."""
+    """Count the numbers that each network reads in a frame."""
     figures = {}
     of_it = next(iter(runs.values()))
     if "ours" in of_it:
-        predictor, normalizers = trained.psi(of_it["ours"])[2:]
-        code, pose = (len(part.mean) for part in normalizers)
-        rows = len(predictor["dense_0"]["kernel"])
+        psi = trained.psi(of_it["ours"])
+        code, pose = (len(part.mean) for part in psi.normalizers)
+        rows = len(psi.predictor["dense_0"]["kernel"])
         figures["ours"] = {"code": code, "pose": pose, "wearer": rows - code - pose, "all": rows}
     if "ncs" in of_it:
         params = trained.network(of_it["ncs"])[1]["params"]
@@ -325,7 +325,7 @@ def inputs(runs: Runs) -> tuple[dict, Section]:
 
 
 def page(sections: list[Section]) -> str:
-    """One HTML file."""
+    """Return one HTML file."""
     body = "".join(f"<h2>{html.escape(title)}</h2>{content}" for title, content in sections)
     return (
         f"<!doctype html><meta charset=utf-8><title>clothjax: the thesis again</title><style>{STYLE}</style>"
@@ -334,7 +334,7 @@ def page(sections: list[Section]) -> str:
 
 
 def table(rows: dict[str, dict], columns: dict[str, str] = MEASURES) -> str:
-    """A table of numbers."""
+    """Return a table of numbers."""
     head = "".join(f"<th>{html.escape(label)}</th>" for label in columns.values())
     lines = [
         f"<tr><th>{html.escape(name)}</th>"
@@ -346,14 +346,14 @@ def table(rows: dict[str, dict], columns: dict[str, str] = MEASURES) -> str:
 
 
 def sheet(rows: dict[str, list[np.ndarray]], columns: list[str]) -> str:
-    """Pictures in rows and columns."""
+    """Draw pictures in rows and columns."""
     buffer = io.BytesIO()
     ray_cast.comparison(buffer, rows, columns)
     return picture(buffer.getvalue())
 
 
 def image(figure: plt.Figure) -> str:
-    """A plot, which is closed."""
+    """Return a plot as an image, and close it."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     plt.close(figure)

@@ -1,8 +1,8 @@
-"""Trains both stages of an experiment: the same program as `python -m clothjax train`.
+"""Train both stages of an experiment: the same program as `python -m clothjax train`.
 
     python -m experiments.train configs/quickstart.yaml
 
-`clothjax/commands/train.py` tells the rest.
+See `clothjax/commands/train.py`.
 """
 
 from clothjax import cli

@@ -1,11 +1,11 @@
-"""Fine-tunes Psi of a garment that comes with the library, or of a packed one, on motions or bodies of yours.
+"""Fine-tune Psi of a garment that comes with the library, or of a packed one, on your motions or bodies.
 
     python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000
 
-Settings are those of the garment's own configuration but for those that are given. It leaves in the folder a packed
-garment, for `clothjax.load` and all programs that take a run, with how it was made in report.json, and `tuning/`. Run
-again, it goes on where it stopped. A garment of the library is configured to be measured on motion capture too, which
-does not come with it: evaluate with `--motions walk_3`.
+Settings default to the garment's own configuration. It writes into the folder `tuning/` and a packed garment, for
+`clothjax.load` and all programs that take a run; report.json has the command and the hours. Run it again to go on where
+it stopped. A garment of the library is configured for evaluation on motion capture too, which does not come with it:
+evaluate with `--motions walk_3`.
 """
 
 import json
@@ -35,23 +35,20 @@ def main(argv: list[str]) -> None:
     if config.tuning.steps < 1:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
-    psi_of_folder = trained.psi(folder)
+    source = trained.psi(folder)
     experiment = assembly.assemble(config)
     clips, _ = assembly.training_clips(experiment)
-    kept = psi.input_joints(experiment.names, config.stage2)
-    seen = stage2.ordinary_poses(experiment.scene, clips, kept, config)
-    scales = psi_of_folder.normalizers
-    normalizers = scales._replace(pose=normalisation.widened(scales.pose, seen))
+    input_joints = psi.input_joints(experiment.names, config.stage2)
+    seen = stage2.ordinary_poses(experiment.scene, clips, input_joints, config)
+    normalizers = source.normalizers._replace(pose=normalisation.widened(source.normalizers.pose, seen))
     run = pipeline.Run(experiment, given.out, clips, None)
-    tuned = pipeline.fine_tune(
-        run, phi["params"], pipeline.Psi(psi_of_folder.garment, psi_of_folder.predictor, normalizers)
-    )
+    tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(source.garment, source.predictor, normalizers))
     size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
-    made = trained.made(folder)
+    about = trained.provenance(folder)
     command = shlex.join(["python", "-m", "experiments.tune", *argv])
-    made["command"] = f"{made['command']} && {command}" if "command" in made else command
-    made["hours"] = made.get("hours", 0.0) + (tuned.seconds + tuned.compile_seconds) / 3600
-    (given.out / trained.REPORT).write_text(json.dumps(made, indent=1) + "\n")
+    about["command"] = f"{about['command']} && {command}" if "command" in about else command
+    about["hours"] = about.get("hours", 0.0) + (tuned.seconds + tuned.compile_seconds) / 3600
+    (given.out / trained.REPORT).write_text(json.dumps(about, indent=1) + "\n")
     print(f"{given.out}: {size / 1e6:.2f} MB of weights")
 
 

@@ -1,19 +1,20 @@
-"""Writes Psi of a run, or a garment that comes with the library, for another runtime, and compares the two there.
+"""Write Psi of a run, or a garment that comes with the library, for another runtime, and compare it with jax.
 
     python -m clothjax convert runs/quickstart --to onnx --int8
     python -m clothjax convert skirt --to stablehlo --out skirt.stablehlo
     python -m clothjax convert dress --to c --out engine/dress.psi
     python -m clothjax convert tshirt --to onnx --batch dynamic --blendshapes 192 --betas 1 0 -0.5
 
-    onnx          ONNX Runtime 1.15 and newer, and engines built on it; for eight bits, --int8; to skin the garment in
-                  the engine, --output canonical; for a garment that nobody sees, --output none
+    onnx          ONNX Runtime 1.15 and newer, and engines built on it. --int8 writes eight bits; --output canonical
+                  is for engines that skin the garment, --output none for a garment that nobody sees
     stablehlo     any process with jax or XLA, on CPU, GPU or TPU, without clothjax
-    litert        LiteRT (TensorFlow Lite), as on phones; for eight bits, --int8
+    litert        LiteRT (TensorFlow Lite), as on phones; --int8 writes eight bits
     c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
-    safetensors   the arrays alone, for whoever builds a runtime
+    safetensors   the arrays alone, for those who build a runtime
 
-A JSON beside the file tells how it is driven. The model is specialised first (`clothjax/runtime/specialise.py`).
-The distance of vertices to jax's unspecialised model over a rollout of 300 frames is printed and written to the JSON.
+A JSON beside the file tells an engine how to drive it. The model is specialised first, by
+`clothjax/runtime/specialise.py`. The distance of vertices to jax's unspecialised model over a rollout of 300 frames is
+printed and written to the JSON.
 """
 
 from pathlib import Path
@@ -40,7 +41,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--int8", action="store_true", help="eight bits")
     parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
     parser.add_argument("--output", choices=["world", "canonical", "none"], default="world", help="of the vertices")
-    parser.add_argument("--blendshapes", type=int, default=None, help="so many at the most; default: all")
+    parser.add_argument("--blendshapes", type=int, default=None, help="largest number; default: all")
     parser.add_argument("--max-influences", type=int, default=None, help="joints that move a vertex; default: all")
     parser.add_argument("--betas", type=float, nargs="+", default=None, help="of the body; default: the mean body")
     parser.add_argument("--material", type=float, nargs=4, default=None, metavar=Material._fields)
@@ -63,7 +64,7 @@ def main(argv: list[str]) -> None:
     error = formats.export(model, arguments.to, out, options, about, _validation(model))
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
     if error is None:
-        print(f"not compared: {form.unrun}")
+        print(f"not compared: {form.not_run}")
     else:
         print(
             f"over {error['frames']} frames of autoregressive rollout: {error['mean_mm']:.4f} mm on average, "
@@ -72,12 +73,12 @@ def main(argv: list[str]) -> None:
 
 
 def _batch(given: str) -> int | None:
-    """Characters a call, None for any number."""
+    """Return the number of characters a call, None for any number."""
     return None if given == "dynamic" else int(given)
 
 
 def _validation(model: Model) -> Motion:
-    """The first validation motion that is here, for FRAMES frames."""
+    """Return the first validation motion that is present, for FRAMES frames."""
     names = [name for name in model.config.evaluation.motions if storage.asset(name).is_file()]
     clip = storage.load_motion(names[0] if names else "walk_3", model.names)
     clip = assembly.there_and_back(clip, FRAMES)

@@ -1,27 +1,28 @@
-"""Measures a run, or garments that come with the library, against the reference solver, in autoregressive rollouts.
+"""Measure a run, or garments that come with the library, against the reference solver, in autoregressive rollouts.
 
     python -m clothjax evaluate runs/quickstart
     python -m clothjax evaluate runs/quickstart --motions walk_3 dance.motion.h5 --json report.json
     python -m clothjax evaluate skirt tshirt --motions walk_3
     python -m clothjax evaluate all --json report.json
 
-Three stages are measured: `lbs` (plain skinning), `phi` (stage 1) and `psi` (stage 2); of a run of a baseline
-`lbs` and its network, by its name. No state is borrowed from the solver: every number is about the stage's own
-trajectory, with the configured material and the betas of `evaluation.betas_seed`. Averages are over frames; medians and
-maxima stand beside them.
+Three stages are measured: `lbs` (plain skinning), `phi` (stage 1) and `psi` (stage 2). For a baseline's run they are
+`lbs` and its network, by name. No state is borrowed from the solver: every number is about the stage's own trajectory,
+with the configured material and the betas of `evaluation.betas_seed`. Averages are over frames; medians and maxima
+stand beside them.
 
     energy_gap      (E - E_min) / (E_skinned - E_min). E is the full incremental potential at unit physical weights
                     given the stage's own two previous frames, E_min the reference solver's minimum from the same two.
                     0 is the solver, 1 plain skinning. The mean is of sums over the frames sampled.
-    hold_gap        the same with E_hold for E_skinned: the last canonical displacement kept. 1 is no dynamics at all.
-    span_gap        the same with the minimum in the span of the learned blend shapes for E: what Phi lacks for lack of
-                    shapes, the rest for lack of training.
+    hold_gap        the same with E_hold for E_skinned, where E_hold is of persistence: the last canonical displacement
+                    again. 1 is no dynamics at all.
+    span_gap        the same with the minimum in the span of the learned blend shapes for E: the part of Phi's gap that
+                    comes from the shapes; training could close the rest.
     step_error_mm   mean (`_p95`, `_max`) distance of vertices to that minimum.
     penetration_percent, penetration_max_mm   vertices inside the whole body (winding number), and the deepest;
-                    `penetration_by_joint`, of each motion: where.
-    swing_ratio, swing_correlation            of the velocity of what skinning does not do, beside the solver's in its
-                    own rollout: 1 is as lively; `rollout_error_mm` is the distance to it, `wrinkle_ratio` the rms
-                    dihedral angle over its.
+                    `penetration_by_joint` counts them by joint for each motion.
+    swing_ratio, swing_correlation            of the velocity that skinning does not explain, relative to the solver's
+                    in its own rollout: 1 is as lively. `rollout_error_mm` is the distance to that rollout,
+                    `wrinkle_ratio` the ratio of rms dihedral angles.
     edge_strain_p95, edge_strain_max          of |l / l_0 - 1|; `edge_strain_ratio`, the first over the solver's.
     jitter          rms of the second time difference of vertex accelerations, over the solver's in its own rollout.
     psi_phi_mm      mean vertex distance of Psi to Phi, over the first motion played there and back for
@@ -33,9 +34,9 @@ maxima stand beside them.
 Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penetration at every fourth frame. With
 `evaluation.wearers` the gaps of nine other characters on the first motion stand under `wearers`.
 
-Of one folder the report is written into it, as `evaluation.json`. Of names, or of several folders, it has the means
-over garments under `mean` and the report of each under its name. Then validation motions are left out that are not
-there: motion capture does not come with the library.
+The report of one folder is written into it, as `evaluation.json`. For names, or several folders, it has the means over
+garments under `mean` and the report of each under its name. Validation motions that are not present are then left out:
+motion capture does not come with the library.
 """
 
 import json

@@ -1,14 +1,14 @@
-"""Pictures and animations of a trained garment.
+"""Render pictures and animations of a trained garment.
 
     python -m clothjax render runs/quickstart --motions walk_3 --out walk.webp
     python -m clothjax render runs/quickstart --motions walk_3 --out comparison.png
     python -m clothjax render skirt --motions dance_3 --out skirt.mp4
     python -m clothjax render skirt --motions walk_3 dance_3 --out skirt.usdc     # skirt_walk_3.usdc and so on
 
-Psi on the body as a film (.webp, .mp4); for a viewer or an animation program with both as meshes (.glb, .usdc, .usda,
-or .obj, of which each frame is a file of its own) or the garment's vertices alone (.pc2, .mdd, with an .obj of the mesh
-to put them on). .png compares skinning, Phi, Psi and the reference solver on a clip that `clothjax evaluate` has
-measured. Of several motions each has a file of its own.
+The suffix of --out chooses the format. .webp and .mp4 are films of Psi on the body. .glb, .usdc, .usda and .obj hold
+garment and body as meshes, .obj with one file a frame. .pc2 and .mdd hold the garment's vertices alone, beside an .obj
+of the mesh to put them on. .png compares skinning, Phi, Psi and the reference solver on a clip that `clothjax evaluate`
+has measured. Each of several motions gets its own file.
 """
 
 from pathlib import Path
@@ -47,5 +47,5 @@ def main(argv: list[str]) -> None:
 
 
 def _out(given: Path, motion: str | None) -> Path:
-    """The file of a motion, None where it is the only one."""
+    """Return the file of a motion, which is None if there is only one."""
     return given if motion is None else given.with_name(f"{given.stem}_{Path(motion).stem}{given.suffix}")

@@ -1,15 +1,16 @@
-"""Trains both stages of an experiment; run it again to go on where it stopped.
+"""Train both stages of an experiment; run it again to go on where it stopped.
 
     python -m clothjax train configs/quickstart.yaml
     python -m clothjax train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
     python -m clothjax train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
     python -m clothjax train --garment skirt_1000 --stage1.steps 2000 --directory runs/skirt     # without a file
 
-It leaves `stage1/`, `stage2/` and, where its steps are not 0, `tuning/` in the run's folder, each with checkpoints,
-metrics.jsonl and training.json. Settings that neither the file nor the command line gives have the library's defaults.
+It writes `stage1/`, `stage2/` and, for fine-tuning if its steps are not 0, `tuning/` into the run's folder, each with
+checkpoints, metrics.jsonl and training.json. Settings that neither the file nor the command line gives have the
+library's defaults.
 
-With `--devices` a number or `auto`, the simulations of an update are spread over devices. The processes of a SLURM,
-Open MPI or Kubernetes job train together, unless `--processes alone`; elsewhere each is told
+`--devices`, a number or `auto`, spreads the simulations of an update over devices. The processes of a SLURM, Open MPI
+or Kubernetes job train together, unless `--processes alone` is given. Elsewhere give each
 `--processes ADDRESS:PORT,COUNT,INDEX`. All of them need the run's folder.
 """
 

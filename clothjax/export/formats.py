@@ -1,4 +1,4 @@
-"""Every format that a model is exported to: how it is written, and run again to be compared."""
+"""The formats that a model is exported to: writing them, and running them again to be compared."""
 
 import json
 import tempfile
@@ -9,30 +9,31 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
+from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
 from clothjax.runtime.inference import Model
 from clothjax.types import Motion
 
 
 class Options(NamedTuple):
-    """Choices that a format may have; a format refuses those that are not its own."""
+    """Choices that a format may have; a format refuses the choices of others."""
 
     int8: bool = False
     batch: int | None = 1  # characters a call, None for any number
-    output: str = "world"  # or "canonical", "none": what is computed of the vertices
-    blendshapes: int | None = None  # so many at the most; None: all
-    max_influences: int | None = None  # joints that move a vertex, at the most; None: all
+    output: Output = "world"  # the vertices that are computed
+    blendshapes: int | None = None  # the largest number; None for all
+    max_influences: int | None = None  # the largest number of joints that move a vertex; None for all
 
 
 class Format(NamedTuple):
-    """The way a format is written and run."""
+    """The functions that write and run a format."""
 
     suffix: str
-    write: Callable[[Model, Path, Options, dict], Any]  # with what its JSON says about the model
+    write: Callable[[Model, Path, Options, dict], Any]  # the last: more entries for its JSON
     run: Callable[[Path, Model, Motion, Options], np.ndarray | None]  # [T, V, 3] m; None: it cannot be run here
-    options: tuple[str, ...] = ()  # of those that not every format has
+    options: tuple[str, ...] = ()  # fields of `Options` that not every format has
     described: bool = True  # whether a JSON beside the file tells how it is driven
-    unrun: str = ""  # why it cannot be run, where it is not
+    not_run: str = ""  # the reason if it cannot be run here
 
 
 def _run_onnx(path: Path, model: Model, motion: Motion, options: Options) -> np.ndarray | None:
@@ -40,7 +41,7 @@ def _run_onnx(path: Path, model: Model, motion: Motion, options: Options) -> np.
 
 
 def _write_litert(model: Model, path: Path, options: Options, about: dict) -> None:
-    model = specialise.smoothed(model) if options.int8 else model
+    model = specialise.equalised(model) if options.int8 else model
     litert.to_litert(model, path, int8=options.int8, about=about)
 
 
@@ -59,7 +60,7 @@ FORMATS = {
         ),
         _run_onnx,
         ("int8", "batch", "output"),
-        unrun="its vertices are not in the world",
+        not_run="its vertices are not in the world",
     ),
     "stablehlo": Format(
         "stablehlo",
@@ -70,24 +71,22 @@ FORMATS = {
         "tflite", _write_litert, lambda path, model, motion, _: litert.run_litert(path, model, motion), ("int8",)
     ),
     "c": Format(
-        "psi", lambda model, path, _, about: native.to_c(model, path, about), _run_c, unrun="there is no C compiler"
+        "psi", lambda model, path, _, about: native.to_c(model, path, about), _run_c, not_run="there is no C compiler"
     ),
     "safetensors": Format(
         "safetensors",
         lambda model, path, *_: safetensors.to_safetensors(model, path),
-        lambda path, _model, motion, _options: np.asarray(
-            inference.animate(safetensors.from_safetensors(path), motion)[0]
-        ),
+        lambda path, _model, motion, _: np.asarray(inference.animate(safetensors.from_safetensors(path), motion)[0]),
         described=False,
     ),
 }  # by the name that a user gives
 
 
 def check(name: str, options: Options) -> None:
-    """Refuses options that are not of a format.
+    """Refuse options that a format does not have.
 
     Raises:
-        ValueError: for such an option, with the formats that it is of.
+        ValueError: for such an option, with the formats that have it.
     """
     for option in ("int8", "batch", "output"):
         chosen = getattr(options, option) != getattr(Options(), option)
@@ -97,16 +96,16 @@ def check(name: str, options: Options) -> None:
 
 
 def export(model: Model, name: str, out: Path, options: Options, about: dict, motion: Motion) -> dict | None:
-    """Writes a specialised model, with its JSON, and compares it to jax's unspecialised one.
+    """Write a specialised model with its JSON, and compare it to jax's unspecialised one.
 
     Args:
         name: of the format.
-        about: of the model, for the JSON.
+        about: more entries for the JSON.
         motion: to compare over.
 
     Returns:
-        The `frames` of the rollout, and the mean and maximal distance of vertices, `mean_mm` and `max_mm`; None where
-        the file cannot be run here.
+        The `frames` of the rollout, and the mean and maximal distance of vertices, `mean_mm` and `max_mm`; None if the
+        file cannot be run here.
     """
     check(name, options)
     form = FORMATS[name]
@@ -120,6 +119,6 @@ def export(model: Model, name: str, out: Path, options: Options, about: dict, mo
     error = {"frames": len(vertices), "mean_mm": float(apart.mean()), "max_mm": float(apart.max())}
     description = out.with_suffix(".json")
     if form.described and description.is_file():
-        told = json.loads(description.read_text())
-        description.write_text(json.dumps(told | {"distance_to_jax": error}))
+        entries = json.loads(description.read_text())
+        description.write_text(json.dumps(entries | {"distance_to_jax": error}))
     return error

@@ -1,4 +1,4 @@
-"""One frame of a model as a function of plain arrays, for runtimes that are given what jax has traced."""
+"""One frame of a model as a function of plain arrays, for runtimes that import a program traced by jax."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ RESULTS = ("next_latent", "next_rotations", "next_positions", "next_translations
 
 
 def function(model: Model) -> Callable:
-    """A frame as a function of `ARGUMENTS`, which gives `RESULTS`."""
+    """Return one frame as a function from `ARGUMENTS` to `RESULTS`."""
 
     def frame(latent, previous_rotations, previous_positions, previous_translations, rotations, translation):
         state = State(latent, previous_rotations, previous_positions, previous_translations, jnp.asarray(True))
@@ -26,14 +26,14 @@ def function(model: Model) -> Callable:
 
 
 def shapes(model: Model) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arguments (all float32)."""
+    """Return the shapes of the arguments, all float32."""
     joints = len(model.parents)
-    each = (model.network.first.shape, (2, joints, 3, 3), (2, joints, 3), (2, 3), (joints, 3, 3), (3,))
-    return dict(zip(ARGUMENTS, each, strict=True))
+    sizes = (model.network.first.shape, (2, joints, 3, 3), (2, joints, 3), (2, 3), (joints, 3, 3), (3,))
+    return dict(zip(ARGUMENTS, sizes, strict=True))
 
 
-def told(model: Model) -> dict:
-    """Return the sidecar entries that describe the call."""
+def describe(model: Model) -> dict:
+    """Return the entries of a JSON that describe the call."""
     return {
         "arguments": {name: list(shape) for name, shape in shapes(model).items()},
         "results": list(RESULTS),

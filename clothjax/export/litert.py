@@ -1,6 +1,6 @@
 """LiteRT (TensorFlow Lite): one frame of a model, for phones and engines that have its runtime.
 
-The converter is TensorFlow's, which is large and wants older packages than we do: give it an environment of its own,
+The converter is TensorFlow's, which is large and needs older packages than clothjax: give it its own environment,
 
     pip install clothjax tensorflow-cpu ai-edge-litert
 """
@@ -8,6 +8,7 @@ The converter is TensorFlow's, which is large and wants older packages than we d
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,65 +20,70 @@ from clothjax.types import Array, Motion, Pose
 
 
 def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict | None = None) -> Path:
-    """Writes one frame of a model as a .tflite of built-in operators, and a JSON as `to_onnx` does.
+    """Write one frame of a model as a .tflite of built-in operators, and a JSON as `to_onnx` does.
 
-    Its one signature has the arguments and results of `frame.ARGUMENTS` and `frame.RESULTS`.
+    The only signature has the arguments `frame.ARGUMENTS` and the results `frame.RESULTS`.
 
     Args:
-        int8: matrices in eight bits, quantised dynamically, but for those that read the pose and that skin; best of a
-            model that `specialise.smoothed` gives.
+        int8: matrices in eight bits, quantised dynamically, except those that read the pose and those that skin; use
+            it with a model from `specialise.equalised`.
         about: more entries for the JSON.
 
     Raises:
         ImportError: if TensorFlow is not installed.
     """
     try:
-        import tensorflow
+        import tensorflow  # pyright: ignore[reportMissingModuleSource]  # not in the environment: too large
         from jax.experimental import jax2tf
     except ImportError as error:
         raise ImportError("TensorFlow is not installed: pip install tensorflow-cpu ai-edge-litert") from error
     path = Path(path)
     shapes = frame.shapes(model)
-    given = [tensorflow.TensorSpec(shape, tensorflow.float32, name=name) for name, shape in shapes.items()]
+    arguments = [tensorflow.TensorSpec(shape, tensorflow.float32, name=name) for name, shape in shapes.items()]
     traced = jax2tf.convert(_partly_quantised(model) if int8 else frame.function(model), with_gradient=False)
 
-    @tensorflow.function(input_signature=given, autograph=False)
-    def named(*arguments):
-        return dict(zip(frame.RESULTS, traced(*arguments), strict=True))
+    @tensorflow.function(input_signature=arguments, autograph=False)
+    def named(*values):
+        return dict(zip(frame.RESULTS, traced(*values), strict=True))
 
-    owner = tensorflow.Module()  # without one a file has no signature
-    owner.frame = named  # pyright: ignore[reportAttributeAccessIssue]  # how TensorFlow keeps a function
+    owner: Any = tensorflow.Module()  # without one a file has no signature
+    owner.frame = named
     converter = tensorflow.lite.TFLiteConverter.from_concrete_functions([named.get_concrete_function()], owner)
     if int8:
         converter.optimizations = [tensorflow.lite.Optimize.DEFAULT]
     path.write_bytes(converter.convert())
-    sidecar.write(model, path, "world", frame.told(model) | (about or {}))
+    sidecar.write(model, path, "world", frame.describe(model) | (about or {}))
     return path
 
 
 def _partly_quantised(model: Model) -> Callable:
-    """`frame.function` whose kernel of the pose and skinning weights the converter leaves alone: it does not see that
-    what is added to them is nothing. In eight bits they err by millimetres, for all inputs of a layer share a scale."""
+    """Return `frame.function` with the pose kernel and the skinning weights hidden from the converter.
+
+    It cannot see that the term added to them is zero, and leaves them in full precision. In eight bits they would err
+    by millimetres, because all inputs of a layer share a scale.
+    """
 
     def hidden(latent: Array, *others: Array) -> tuple:
-        nothing = jnp.where(jnp.abs(latent[0]) < 0.0, 1.0, 0.0)  # also of NaN
-        network = model.network._replace(pose=model.network.pose + nothing, weights=model.network.weights + nothing)
+        zero = jnp.where(jnp.abs(latent[0]) < 0.0, 1.0, 0.0)  # also of NaN
+        network = model.network._replace(pose=model.network.pose + zero, weights=model.network.weights + zero)
         return frame.function(dataclasses.replace(model, network=network))(latent, *others)
 
     return hidden
 
 
 def run_litert(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
-    """Vertices [T, V, 3] m of a file over a motion, in LiteRT on one thread.
+    """Run a file over a motion in LiteRT on one thread; return vertices [T, V, 3] m.
 
     Args:
-        model: for the state before the first frame.
+        model: the one that was written, for the state before the first frame.
 
     Raises:
         ImportError: if LiteRT is not installed.
     """
     try:
-        from ai_edge_litert.interpreter import Interpreter  # pyright: ignore[reportMissingImports]  # an optional package
+        from ai_edge_litert.interpreter import (  # pyright: ignore[reportMissingImports]  # needs TensorFlow's environment
+            Interpreter,
+        )
     except ImportError as error:
         raise ImportError("LiteRT is not installed: pip install ai-edge-litert") from error
     run = Interpreter(model_path=str(path), num_threads=1).get_signature_runner()
@@ -85,7 +91,7 @@ def run_litert(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     state = inference.initial_state(model, Pose(rotations[0], translation[0]))[:-1]
     vertices = []
     for pose in zip(rotations, translation, strict=True):
-        found = run(**dict(zip(frame.ARGUMENTS, (*map(np.asarray, state), *pose), strict=True)))
-        state = [found[name] for name in frame.RESULTS[: len(state)]]
-        vertices.append(found["vertices"])
+        results = run(**dict(zip(frame.ARGUMENTS, (*map(np.asarray, state), *pose), strict=True)))
+        state = [results[name] for name in frame.RESULTS[: len(state)]]
+        vertices.append(results["vertices"])
     return np.stack(vertices)

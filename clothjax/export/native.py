@@ -1,32 +1,32 @@
 """Plain C: the matrices of a model in eight bits for `psi.c`, which needs no runtime.
 
-A `.psi` is little-endian; every array in it begins at a multiple of 64 bytes. Of a matrix each row (what gives one
-output) has a scale of its own; its inputs `psi.c` quantises to sixteen bits (up to 512 of them; fewer bits for more),
-after a gain where they differ in scale.
+A `.psi` is little-endian, and every array in it begins at a multiple of 64 bytes. Each row of a matrix, which gives one
+output, has its own scale. `psi.c` quantises up to 512 inputs of a matrix to sixteen bits, more inputs to fewer bits.
+Inputs that differ in scale are first multiplied by gains.
 """
 
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from clothjax.export import sidecar
-from clothjax.runtime.inference import Bounds, Layer, Model
+from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model
 from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1
 ALIGN = 64
-LANES = 64  # vertices that are skinned at once
+LANES = 64  # vertices skinned at once
 FLAGS = ("-O3", "-march=native")
 
 
 def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
-    """Writes a model for `psi.c`, and beside it a JSON that tells an engine how to drive it, `psi.c` and `psi.h`.
+    """Write a model for `psi.c`, and beside it `psi.c`, `psi.h` and a JSON that tells an engine how to drive it.
 
     Args:
         about: more entries for the JSON.
@@ -40,7 +40,7 @@ def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
 
 
 def packed(model: Model) -> bytes:
-    """Describe the contents of a model's file."""
+    """Return the content of a model's file."""
     parts = (array.astype(array.dtype.newbyteorder("<")).tobytes() for array in _arrays(model))
     return b"".join(part + bytes(-len(part) % ALIGN) for part in parts)
 
@@ -49,15 +49,14 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     """Yield the arrays of a file in their order."""
     network, wearer = model.network, model.wearer
     code = len(network.first)
-    wide = network.decoder_width
     head = (
-        MAGIC, VERSION, len(model.parents), len(model.kept), len(model.moving), wearer.template.shape[1], code,
-        len(network.hidden), len(network.decoder), len(network.read.bias) > wide, model.config.model.blendshape_relu,
-        network.mix is not None, bool(wearer.known), 0, 0, 0,
+        MAGIC, VERSION, len(model.parents), len(model.input_joints), len(model.moving), wearer.template.shape[1], code,
+        len(network.hidden), len(network.decoder), len(network.read.bias) > network.width,
+        model.config.model.blendshape_relu, network.mix is not None, bool(wearer.known), 0, 0, 0,
     )  # fmt: skip
     yield np.array(head, np.int32)
     yield np.array([model.config.fps, model.config.stage2.latent_decay], np.float32)
-    for integers in (model.parents, model.kept, model.moving):
+    for integers in (model.parents, model.input_joints, model.moving):
         yield np.array(integers, np.int32)
     yield np.asarray(wearer.joints, np.float32)
     weights = np.asarray(network.weights, np.float32)
@@ -66,16 +65,16 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     yield from _bounds(network.pose_bounds, len(network.pose_mean))
     yield from _bounds(network.code_bounds, code)
     yield np.asarray(network.first, np.float32)
-    yield from _layer(Layer(network.pose, network.code.bias + wearer.bias), even=True)
+    yield from _layer(Layer(network.pose, network.code.bias + wearer.bias), gains=True)
     yield from _layer(network.code._replace(bias=np.zeros(len(wearer.bias))))
     for layer in network.hidden:
         yield from _layer(layer)
-    yield from _layer(network.read, even=True)
+    yield from _layer(network.read, gains=True)
     for layer in network.decoder:
         yield from _layer(layer)
     if network.mix is not None:
         yield from _layer(network.mix)
-    yield from _layer(Layer(network.shapes, wearer.template.reshape(-1)), even=True)
+    yield from _layer(Layer(network.shapes, wearer.template.reshape(-1)), gains=True)
 
 
 def _bounds(bounds: Bounds, size: int) -> Iterator[np.ndarray]:
@@ -83,9 +82,9 @@ def _bounds(bounds: Bounds, size: int) -> Iterator[np.ndarray]:
         yield np.broadcast_to(np.asarray(row, np.float32), size)
 
 
-def _layer(layer: Layer, even: bool = False) -> Iterator[np.ndarray]:
-    kernel = np.zeros((0, len(layer.bias))) if layer.kernel is None else layer.kernel
-    eight, gain, scale = eight_bits(kernel, even)
+def _layer(layer: Layer | FoldedLayer, gains: bool = False) -> Iterator[np.ndarray]:
+    kernel = layer.kernel if isinstance(layer, Layer) else np.zeros((0, len(layer.bias)))
+    eight, gain, scale = eight_bits(kernel, gains)
     yield np.array([len(kernel), len(layer.bias)], np.int32)
     yield gain
     yield np.asarray(layer.bias, np.float32)
@@ -93,15 +92,16 @@ def _layer(layer: Layer, even: bool = False) -> Iterator[np.ndarray]:
     yield np.pad(eight, [(0, 0), (0, -len(kernel) % ALIGN)])
 
 
-def eight_bits(kernel: Array, even: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A kernel [inputs, outputs] as a matrix [outputs, inputs] int8, gains [inputs] and scales [outputs]: it is
-    scales * matrix * gains.
+def eight_bits(kernel: Array, gains: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a kernel [inputs, outputs] as a matrix [outputs, inputs] int8, gains [inputs] and scales [outputs].
+
+    The transposed kernel is scales * matrix * gains.
 
     Args:
-        even: whether columns that are finer than others get a gain, for their eight bits.
+        gains: whether each column gets a gain, so that small columns use all of their eight bits; else gains are 1.
     """
     rows = np.asarray(kernel, np.float64).T
-    gain = np.abs(rows).max(axis=0, initial=0.0) if even else np.ones(rows.shape[1])
+    gain = np.abs(rows).max(axis=0, initial=0.0) if gains else np.ones(rows.shape[1])
     gain[gain == 0] = 1.0
     rows = rows / gain
     scale = np.abs(rows).max(axis=1, initial=0.0) / 127.0
@@ -110,40 +110,40 @@ def eight_bits(kernel: Array, even: bool) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def compiler() -> str | None:
-    """This machine's C compiler."""
+    """Return this machine's C compiler, None if there is none."""
     return next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
 
 
 def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
-    """`psi.c` as a shared library in a folder, by this machine's C compiler.
+    """Compile `psi.c` into a shared library in a folder; return its path.
 
     Raises:
         OSError: if there is no compiler, or it fails.
     """
     library = Path(directory) / "libpsi.so"
-    compiled(compiler(), "C", [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
+    run_compiler(compiler(), "C", [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
     return library
 
 
-def compiled(program: str | None, language: str, arguments: list[str | Path]) -> None:
-    """A compiler has done as it was told.
+def run_compiler(program: str | None, language: str, arguments: Sequence[str | Path]) -> None:
+    """Run a compiler.
 
     Raises:
-        OSError: if there is none, or it fails.
+        OSError: if there is no compiler, or it fails.
     """
     if program is None:
         raise OSError(f"no compiler for {language} on the path: install gcc or clang")
     command = [program, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
 
 
 class Psi:
-    """A file in `psi.c`, with one character.
+    """A model file loaded into `psi.c`, with one character.
 
     Args:
-        library: as `build` makes it.
+        library: path of the library that `build` compiled.
         rotations, translation: [J, 3, 3] and [3] m, the pose in which the character has been standing.
 
     Raises:
@@ -155,11 +155,10 @@ class Psi:
         self._c = ctypes.CDLL(str(library))
         for name in ("psi_load", "psi_begin"):
             getattr(self._c, name).restype = ctypes.c_void_p
-        why = ctypes.c_char_p()
-        self._model = ctypes.c_void_p(self._c.psi_load(str(path).encode(), ctypes.byref(why)))
+        reason = ctypes.c_char_p()
+        self._model = ctypes.c_void_p(self._c.psi_load(str(path).encode(), ctypes.byref(reason)))
         if not self._model:
-            reason = (why.value or b"unreadable").decode()
-            raise ValueError(f"{path}: {reason}")
+            raise ValueError(f"{path}: {(reason.value or b'').decode()}")
         self.joints = self._c.psi_joints(self._model)
         self.vertices = np.zeros((self._c.psi_vertices(self._model), 3), np.float32)
         pose = self._pose(rotations, translation)
@@ -168,14 +167,14 @@ class Psi:
             raise MemoryError(f"no memory for a character in {path}")
 
     def step(self, rotations: Array, translation: Array, vertices: bool = True) -> bool:
-        """The next frame, into `vertices` [V, 3] m if asked for; `State.ok` of it."""
+        """Compute the next frame, into `vertices` [V, 3] m if asked for; return its `State.ok`."""
         return bool(self.bound(rotations, translation, vertices)())
 
     def bound(self, rotations: Array, translation: Array, vertices: bool = True) -> Callable[[], int]:
-        """A call that takes the next frame, of what these arrays then hold, if they are contiguous float32."""
+        """Return a function that computes the next frame from the values then in these arrays, contiguous float32."""
         pose = self._pose(rotations, translation)
-        shown = _pointer(self.vertices) if vertices else None
-        arguments = (self._model, self._state, *map(_pointer, pose), shown)
+        vertices_out = _pointer(self.vertices) if vertices else None
+        arguments = (self._model, self._state, *map(_pointer, pose), vertices_out)
         return lambda: self._c.psi_step(*arguments)
 
     def _pose(self, rotations: Array, translation: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +195,7 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def run_c(library: str | Path, path: str | Path, motion: Motion) -> np.ndarray:
-    """Vertices [T, V, 3] m of a file over a motion."""
+    """Run a file over a motion; return vertices [T, V, 3] m."""
     psi = Psi(library, path, motion.rotations[0], motion.translation[0])
     vertices = []
     for pose in zip(motion.rotations, motion.translation, strict=True):

@@ -11,7 +11,7 @@ from clothjax.export import sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.inference import Layer, Model
+from clothjax.runtime.inference import FoldedLayer, Layer, Model
 from clothjax.types import Array, Motion, Pose
 
 INPUTS = ("latent", "history", "rotations", "translation")
@@ -27,32 +27,33 @@ def to_onnx(
     output: Output = "world",
     about: dict | None = None,
 ) -> Path:
-    """Writes one frame of a model as ONNX, and beside it a JSON that tells an engine how to drive it.
+    """Write one frame of a model as ONNX, and beside it a JSON that tells an engine how to drive it.
 
-    Inputs, all with a leading axis [N] of characters, are the state (`latent` [C] and `history` [2, 12 J + 3], of the
-    last two frames) and the pose to come (`rotations` [J, 3, 3] local, `translation` [3] m); outputs are the next
-    state (`next_latent`, `next_history`), `ok` (see `inference`) and `vertices`.
+    All inputs and outputs have a leading axis [N] of characters. The state is `latent` [C]
+    and `history` [2, 12 J + 3] of the last two frames, the pose to come `rotations` [J, 3, 3] local and `translation`
+    [3] m.
+    Outputs are the next state (`next_latent`, `next_history`), `ok` (see `inference`) and `vertices`.
 
     Args:
-        batch: N; None for one that may differ from call to call. All wear the same body and cloth.
+        batch: N; None if it may differ from call to call. All characters have the same body and cloth.
         int8: matrices in eight bits, quantised dynamically.
-        output: `vertices` [V, 3] m in the world, those in the canonical pose for an engine to skin, or none, for a
-            garment that nobody sees.
+        output: `vertices` [V, 3] m in the world; in the canonical pose, for an engine to skin; or none, for a garment
+            that nobody sees.
         about: more entries for the JSON.
 
     Raises:
         ImportError: if the extra `export` is not installed.
     """
     path = Path(path)
-    given, following, graph = _frame(model, "N" if batch is None else batch, int8, output)
-    graph.save(path, given, following, flags=("ok",))
-    shapes = {"shapes": {name: list(shape) for name, shape in (given | following).items()}}
+    inputs, outputs, graph = _frame(model, "N" if batch is None else batch, int8, output)
+    graph.save(path, inputs, outputs, flags=("ok",))
+    shapes = {"shapes": {name: list(shape) for name, shape in (inputs | outputs).items()}}
     sidecar.write(model, path, output, sidecar.STATE | shapes | (about or {}))
     return path
 
 
 def first_state(model: Model, pose: Pose, batch: int = 1) -> list[np.ndarray]:
-    """`latent` and `history` before the first frame, for `batch` characters that stand in `pose`."""
+    """Return `latent` and `history` before the first frame, for `batch` characters that stand in `pose`."""
     state = inference.initial_state(model, pose)
     rows = (state.rotations, state.translation, state.positions)
     history = np.concatenate([np.asarray(x).reshape(2, -1) for x in rows], axis=1)
@@ -60,10 +61,10 @@ def first_state(model: Model, pose: Pose, batch: int = 1) -> list[np.ndarray]:
 
 
 def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
-    """Vertices [T, V, 3] m of a file over a motion, in ONNX Runtime on one thread.
+    """Run a file over a motion in ONNX Runtime on one thread; return vertices [T, V, 3] m.
 
     Args:
-        model: that was written, for the state before the first frame.
+        model: the one that was written, for the state before the first frame.
 
     Raises:
         ImportError: if onnxruntime is not installed.
@@ -76,13 +77,14 @@ def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     vertices = []
     for pose in zip(rotations, translation, strict=True):
         pose = [np.repeat(x, batch, axis=0) for x in pose]
-        *state, shown = run.run([*FOLLOWING[:-1], "vertices"], dict(zip(INPUTS, (*state, *pose), strict=True)))
-        vertices.append(np.asarray(shown)[0])
+        results = run.run([*FOLLOWING[:-1], "vertices"], dict(zip(INPUTS, (*state, *pose), strict=True)))
+        *state, frame_vertices = map(np.asarray, results)
+        vertices.append(frame_vertices[0])
     return np.stack(vertices)
 
 
 def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[dict, dict, Graph]:
-    """The inputs, the outputs and the graph of one frame, operator for operator `inference.step`."""
+    """Return the inputs, the outputs and the graph of one frame, which follows `inference.step`."""
     g, network, wearer = Graph(int8), model.network, model.wearer
     joints, count = np.asarray(wearer.joints, np.float32), len(model.parents)
     sound, pose, last = _sound(g, count)
@@ -90,7 +92,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     places = g.reshape(_places(g, chain, joints), 1, 3 * count)
     frames = g("Concat", g("Concat", pose, places, axis=2), "history", axis=1)
     g.slice(frames, 1, 0, 2, "next_history")
-    inputs, order = _inputs(g, frames, last, joints[model.kept[0]], model)
+    inputs, order = _inputs(g, frames, last, joints[model.input_joints[0]], model)
     inputs = g("Sub", inputs, np.asarray(network.pose_mean)[order])
     bounds = network.pose_bounds
     inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
@@ -120,8 +122,10 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
 
 
 def _sound(g: Graph, count: int) -> tuple[str, str, str]:
-    """Return whether the pose is finite [N, 1, 1], its rotations and translation [N, 1, 9 J + 3] or else the last ones,
-    and these last ones."""
+    """Return whether the pose is finite [N, 1, 1], the pose to use [N, 1, 9 J + 3], and the last one.
+
+    The last pose replaces one that is not finite.
+    """
     given = g("Concat", g.reshape("rotations", 1, 9 * count), g.reshape("translation", 1, 3), axis=2)
     last = g.slice(g.slice("history", 1, 0, 1), 2, 0, 9 * count + 3)
     limits = np.repeat([2.0, inference.FARTHEST], [9 * count, 3]).astype(np.float32)
@@ -130,9 +134,9 @@ def _sound(g: Graph, count: int) -> tuple[str, str, str]:
 
 
 def _chain(g: Graph, local: str, joints: Array, parents: Array) -> str:
-    """Skinning transforms [R | q - R J] as [N, J + 1, 4, 4] of local rotations [N, J, 3, 3], the last the identity.
+    """Return skinning transforms [R | q - R J] [N, J + 1, 4, 4] of local rotations [N, J, 3, 3].
 
-    Pointer jumping, as in `skinning.forward_kinematics`.
+    The last is the identity. The method is pointer jumping, as in `skinning.forward_kinematics`.
     """
     count = len(parents)
     turned = g("ReduceSum", g("Mul", local, joints[None, :, None]), np.array([3], np.int64), keepdims=1)
@@ -150,7 +154,7 @@ def _chain(g: Graph, local: str, joints: Array, parents: Array) -> str:
 
 
 def _places(g: Graph, chain: str, joints: Array) -> str:
-    """Positions [N, J, 3] m of the joints."""
+    """Return the positions [N, J, 3] m of the joints."""
     count = len(joints)
     homogeneous = np.concatenate([joints, np.ones((count, 1))], axis=1).astype(np.float32)
     part = g("Slice", chain, *(np.array(x, np.int64) for x in ([0, 0], [count, 3], [1, 2])))
@@ -158,15 +162,15 @@ def _places(g: Graph, chain: str, joints: Array) -> str:
 
 
 def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tuple[str, np.ndarray]:
-    """The inputs [N, P] of `psi.pose_inputs`, in another order, and for each its place in that.
+    """Return the inputs [N, P] of `psi.pose_inputs` in another order, and the index of each in that of `psi`.
 
     Args:
-        frames: [N, 3, 12 J + 3] rows of the history, the new one first.
-        last: the row of the frame before, or its beginning.
+        frames: [N, 3, 12 J + 3] rows of the history, newest first.
+        last: the row of the frame before, or the beginning of it.
     """
-    count, root, others = len(model.parents), model.kept[0], np.array(model.kept[1:], np.int64)
+    count, root, others = len(model.parents), model.input_joints[0], np.array(model.input_joints[1:], np.int64)
     seen = len(others)
-    # cosine and sine of the heading, times something: r00 + r22 and r02 - r20
+    # cosine and sine of the heading, up to a common factor: r00 + r22 and r02 - r20
     pick = np.zeros((9, 2), np.float32)
     pick[[0, 8], 0], pick[2, 1], pick[6, 1] = 1.0, 1.0, -1.0
     direction = g("MatMul", g.slice(last, 2, 9 * root, 9 * root + 9), pick)
@@ -198,46 +202,47 @@ def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tu
 
 
 def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:
-    """The next code [N, C], named `next_latent`, and how far it was brought back."""
+    """Return the next code [N, C], named `next_latent`, and the distance by which it was clipped."""
     network = model.network
-    kernel, bias = network.code
+    code = network.code
     first = np.asarray(network.pose)[order]
-    bias = np.asarray(bias) + np.asarray(model.wearer.bias)
+    bias = np.asarray(code.bias) + np.asarray(model.wearer.bias)
     limits = [np.maximum(-np.asarray(b.low), np.asarray(b.high)) for b in (network.pose_bounds, network.code_bounds)]
     limits[0] = limits[0][order]
-    if network.folded:
-        x = g("Add", g.even(inputs, limits[0], Layer(first, bias)), g.slice("latent", 1, 0, len(bias)))
+    if isinstance(code, FoldedLayer):
+        x = g("Add", g.balanced(inputs, limits[0], Layer(first, bias)), g.slice("latent", 1, 0, len(bias)))
     else:
         both = g("Concat", inputs, "latent", axis=1)
-        x = g.even(both, np.concatenate(limits), Layer(np.concatenate([first, np.asarray(kernel)]), bias))
+        x = g.balanced(both, np.concatenate(limits), Layer(np.concatenate([first, np.asarray(code.kernel)]), bias))
     for layer in network.hidden:
         x = g.layer(g("Relu", x), layer)
-    kept = g("Mul", "latent", np.float32(1.0 - model.config.stage2.latent_decay))
+    decayed = g("Mul", "latent", np.float32(1.0 - model.config.stage2.latent_decay))
     bounds = network.code_bounds
-    return g.within(g("Add", kept, x), bounds.low, bounds.high, name="next_latent")
+    return g.within(g("Add", decayed, x), bounds.low, bounds.high, name="next_latent")
 
 
 def canonical(g: Graph, latent: str, model: Model) -> str:
-    """The garment [N, 3 V] m in the canonical pose, one coordinate after the other."""
-    limits = np.abs(specialise.ordinary_weights(model)).max(axis=0) if g.int8 else None
-    template = np.asarray(model.wearer.template).reshape(-1)
-    return g.even(shape_weights(g, latent, model), limits, Layer(model.network.shapes, template))
+    """Return the garment [N, 3 V] m in the canonical pose, one coordinate after the other."""
+    shapes = Layer(model.network.shapes, np.asarray(model.wearer.template).reshape(-1))
+    weights = shape_weights(g, latent, model)
+    if not g.int8:
+        return g.layer(weights, shapes)
+    return g.balanced(weights, np.abs(specialise.ordinary_weights(model)).max(axis=0), shapes)
 
 
 def shape_weights(g: Graph, latent: str, model: Model) -> str:
-    """The weights [N, K] of the blend shapes."""
+    """Return the weights [N, K] of the blend shapes."""
     network = model.network
-    size, wide = len(network.read.bias), network.decoder_width
-    if network.folded:
-        whole = len(network.first)
-        read = g("Add", g.slice(latent, 1, whole - size, whole), network.read.bias)
+    size, width, code = len(network.read.bias), network.width, len(network.first)
+    if isinstance(network.read, FoldedLayer):
+        read = g("Add", g.slice(latent, 1, code - size, code), network.read.bias)
     else:
         read = g.twice(latent, network.read)
-    x = read if size == wide else g.slice(read, 1, 0, wide)
+    x = read if size == width else g.slice(read, 1, 0, width)
     for layer in network.decoder:
         x = g.layer(g("Relu", x), layer)
-    if size > wide:
-        x = g("Add", x, g.slice(read, 1, wide, size))
+    if size > width:
+        x = g("Add", x, g.slice(read, 1, width, size))
     if model.config.model.blendshape_relu:
         x = g("Relu", x)
     return x if network.mix is None else g.layer(x, network.mix)

@@ -1,4 +1,4 @@
-"""Building, saving and running ONNX graphs.
+"""ONNX graphs: building, saving and running them.
 
 Opset 17 and IR 8 are the newest that ONNX Runtime 1.15, still in engines, loads.
 """
@@ -13,13 +13,14 @@ from clothjax.runtime.specialise import smoothing_scale
 from clothjax.types import Array
 
 OPSET, IR_VERSION = 17, 8
+Value = Array | np.generic  # of a constant
 
 
 class Graph:
-    """Nodes and constants of a graph under construction.
+    """An ONNX graph under construction: its nodes and constants.
 
     Args:
-        int8: dense layers have matrices of eight bits, quantised dynamically.
+        int8: whether dense layers get matrices of eight bits, quantised dynamically.
 
     Raises:
         ImportError: if the extra `export` is not installed.
@@ -32,14 +33,15 @@ class Graph:
             raise ImportError("ONNX export needs onnx: pip install clothjax[export]") from error
         self.onnx, self.nodes, self.constants, self.int8 = onnx, [], [], int8
 
-    def __call__(self, operator: str, *inputs: str | Array | np.generic, name: str | None = None, **attributes) -> str:
-        """Adds a node; arrays among its inputs become constants. Returns the name of its output."""
+    def __call__(self, operator: str, *inputs: str | Value, name: str | None = None, **attributes) -> str:
+        """Add a node; arrays among its inputs become constants. Return the name of its output."""
         names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
         name = name or f"{operator.lower()}_{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(operator, names, [name], name=name, **attributes))
         return name
 
-    def constant(self, array: Array | np.generic) -> str:
+    def constant(self, array: Value) -> str:
+        """Add a constant, float32 if it was float64; return its name."""
         array = np.asarray(array)
         if array.dtype == np.float64:
             array = array.astype(np.float32)
@@ -48,27 +50,31 @@ class Graph:
         return name
 
     def reshape(self, x: str, *shape: int) -> str:
-        # zero keeps the axis of characters
-        return self("Reshape", x, np.array((0, *shape), np.int64))
+        """Reshape all axes of x but the first, of characters, to `shape`."""
+        return self("Reshape", x, np.array((0, *shape), np.int64))  # 0: the axis stays
 
     def slice(self, x: str, axis: int, start: int, end: int, name: str | None = None) -> str:
+        """Return entries [start, end) of x along an axis."""
         return self("Slice", x, *(np.array([i], np.int64) for i in (start, end, axis)), name=name)
 
     def within(self, x: str, low: Array, high: Array, name: str | None = None) -> tuple[str, str]:
-        """x brought into [low, high], and how far it was moved."""
+        """Clip x to [low, high]; return it and the distance by which it was clipped."""
         inside = self("Min", self("Max", x, np.asarray(low)), np.asarray(high), name=name)
         return inside, self("Abs", self("Sub", inside, x))
 
     def layer(self, x: str, layer: Layer) -> str:
+        """Apply a dense layer."""
         return self("Add", self.product(x, layer.kernel), layer.bias)
 
     def product(self, x: str, kernel: str | Array) -> str:
-        """A dense layer without a bias."""
+        """Apply a dense layer without a bias."""
         return self("MatMul", x, kernel, name=f"dense_{len(self.nodes)}")
 
     def twice(self, x: str, layer: Layer) -> str:
-        """`layer`; where matrices have eight bits, of inputs in eight bits and of what these leave, in eight again. So
-        the inputs can take over all of what makes a column of weights smaller than others."""
+        """Apply a dense layer; with matrices of eight bits, to the quantised inputs and to their quantised remainder.
+
+        The inputs then have enough bits to carry the gains of all rows of the kernel.
+        """
         if not self.int8:
             return self.layer(x, layer)
         gain = np.maximum(np.abs(np.asarray(layer.kernel)).max(axis=1), 1e-6)
@@ -76,25 +82,27 @@ class Graph:
         quantised = f"quantised_{len(self.nodes)}"
         names = [quantised, f"{quantised}_scale", f"{quantised}_zero"]
         self.nodes.append(self.onnx.helper.make_node("DynamicQuantizeLinear", [x], names, name=quantised))
-        held = self("DequantizeLinear", *names)
-        left = self("Sub", x, held)
-        return self("Add", self("Add", self.product(held, kernel), self.product(left, kernel)), layer.bias)
+        coarse = self("DequantizeLinear", *names)
+        rest = self("Sub", x, coarse)
+        return self("Add", self("Add", self.product(coarse, kernel), self.product(rest, kernel)), layer.bias)
 
-    def even(self, x: str, limits: Array | None, layer: Layer) -> str:
-        """Add `layer` of inputs within +-`limits`; in eight bits both are scaled by `specialise.smoothing_scale`."""
-        if limits is None or not self.int8:
+    def balanced(self, x: str, limits: Array, layer: Layer) -> str:
+        """Apply a dense layer to inputs within +-`limits`; with eight bits both are scaled by `smoothing_scale`."""
+        if not self.int8:
             return self.layer(x, layer)
         scale = smoothing_scale(limits, layer.kernel)
         return self.layer(self("Mul", x, 1.0 / scale), Layer(np.asarray(layer.kernel) * scale[:, None], layer.bias))
 
     def all(self, flags: str, axis: int) -> str:
-        """Add a node that tells whether all bools hold along an axis; the axis stays."""
+        """Return whether all bools along an axis are true; the axis stays, with size 1."""
         least = self("ReduceMin", self("Cast", flags, to=self.onnx.TensorProto.FLOAT), axes=[axis], keepdims=1)
         return self("Greater", least, np.float32(0.5))
 
     def skinned(self, garment: str, transforms: str, weights: Array) -> str:
-        """Vertices [N, 3, V] of a garment [N, 3 V] skinned by transforms [N, J, 12] of joints with weights [J, V],
-        one coordinate after the other."""
+        """Skin a garment [N, 3 V] by transforms [N, J, 12] of joints with weights [J, V]; return vertices [N, 3, V].
+
+        The garment has one coordinate after the other.
+        """
         vertices = np.shape(weights)[1]
         rows = self("MatMul", self("Transpose", transforms, perm=[0, 2, 1]), np.asarray(weights), name="skinning")
         one_more = np.array([0, 0, 0, 0, 0, 0, 1, 0], np.int64)
@@ -103,10 +111,11 @@ class Graph:
         return self("ReduceSum", moved, np.array([2], np.int64), keepdims=0)
 
     def save(self, path: Path, inputs: dict[str, tuple], outputs: dict[str, tuple], flags: tuple[str, ...] = ()):
-        """Checks the graph and writes it.
+        """Check the graph and write it.
 
         Args:
-            inputs, outputs: shapes of float32 tensors by name, or, for the `flags` among them, of bools.
+            inputs, outputs: shapes of tensors by name.
+            flags: names of those that are bool; the others are float32.
         """
         helper, kinds = self.onnx.helper, self.onnx.TensorProto
         described = [
@@ -118,27 +127,27 @@ class Graph:
         ]
         graph = helper.make_graph(self.nodes, "clothjax", *described, self.constants)
         opset = [helper.make_opsetid("", OPSET)]
-        made = helper.make_model(graph, opset_imports=opset, producer_name="clothjax", ir_version=IR_VERSION)
-        self.onnx.checker.check_model(made, full_check=True)
+        model = helper.make_model(graph, opset_imports=opset, producer_name="clothjax", ir_version=IR_VERSION)
+        self.onnx.checker.check_model(model, full_check=True)
         if not self.int8:
-            self.onnx.save(made, str(path))
+            self.onnx.save(model, str(path))
             return
         try:
             from onnxruntime.quantization import QuantType, quantize_dynamic
         except ImportError as error:
             raise ImportError("int8 needs onnxruntime: pip install clothjax[export]") from error
         with tempfile.TemporaryDirectory() as folder:
-            whole = Path(folder) / "whole.onnx"
-            self.onnx.save(made, str(whole))
+            full = Path(folder) / "full.onnx"
+            self.onnx.save(model, str(full))
             dense = [node.name for node in self.nodes if node.name.startswith("dense_")]
             quantize_dynamic(
-                whole, path, weight_type=QuantType.QInt8, per_channel=True, nodes_to_quantize=dense,
+                full, path, weight_type=QuantType.QInt8, per_channel=True, nodes_to_quantize=dense,
                 extra_options={"MatMulConstBOnly": True},
             )  # fmt: skip
 
 
 def session(path: str | Path):
-    """An ONNX Runtime session of a file, on one thread."""
+    """Open a file in ONNX Runtime, on one thread."""
     try:
         import onnxruntime
     except ImportError as error:

@@ -1,7 +1,7 @@
 """`psi.c` inside of jax, on a CPU: the same step as `clothjax.runtime.inference.step`, in eight bits and plain C.
 
-XLA has no fast product of a vector and a matrix of low precision; `psi.c` has. Where there are a C and a C++ compiler,
-it is built when a model is first packed, and registered with `jax.ffi`.
+XLA has no fast product of a vector and a matrix of low precision; `psi.c` has. It is built when a model is first
+packed, which needs a C and a C++ compiler, and registered with `jax.ffi`.
 """
 
 import ctypes
@@ -27,14 +27,14 @@ TARGET = "clothjax_psi_step"
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("file",), meta_fields=("vertices",))
 @dataclasses.dataclass(frozen=True)
 class Packed:
-    """A garment on a character in plain C."""
+    """A garment on a character, packed for plain C."""
 
     file: Array  # [bytes] uint8, a .psi
     vertices: int
 
 
 def available() -> bool:
-    """Return True if jax computes on a CPU and the compilers are there."""
+    """Return whether jax computes on a CPU and both compilers are present."""
     return jax.default_backend() == "cpu" and None not in (native.compiler(), _compiler())
 
 
@@ -43,7 +43,7 @@ def _compiler() -> str | None:
 
 
 def pack(model: Model) -> Packed:
-    """A model for `step`, best a specialised one: one wearer's.
+    """Pack a model of one character for `step`; a specialised one is fastest.
 
     Raises:
         OSError: if jax does not compute on a CPU, or a compiler is missing or fails.
@@ -58,25 +58,26 @@ def pack(model: Model) -> Packed:
 def _register() -> None:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         plain, library = Path(folder) / "psi.o", Path(folder) / "libpsi_ffi.so"
-        native.compiled(native.compiler(), "C", [*native.FLAGS, "-fPIC", "-c", native.SOURCES[1], "-o", plain])
+        native.run_compiler(native.compiler(), "C", [*native.FLAGS, "-fPIC", "-c", native.SOURCES[1], "-o", plain])
         includes = [f"-I{folder}" for folder in (native.SOURCES[0].parent, jax.ffi.include_dir())]
         shared = ["-std=c++17", "-O2", "-fPIC", "-shared", *includes, SOURCE, plain, "-o", library]
-        native.compiled(_compiler(), "C++", shared)
+        native.run_compiler(_compiler(), "C++", shared)
         handler = ctypes.CDLL(str(library)).PsiStep  # it stays loaded when its file is gone
     jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
 
 
 @functools.partial(jax.jit, static_argnames="vertices")
 def step(packed: Packed, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
-    """`inference.step` of a packed model, from a state that `inference.initial_state` gave of the model itself.
+    """Take `inference.step` with a packed model, from a state that `inference.initial_state` made for the model itself.
 
     Raises:
         jax.errors.JaxRuntimeError: for a state or a pose of another garment, or a damaged file.
     """
     carried, restored = ravel_pytree(state[:4])
-    seen = (packed.vertices if vertices else 0, 3)
+    shape = (packed.vertices if vertices else 0, 3)
     kinds = [jax.ShapeDtypeStruct(carried.shape, jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_),
-             jax.ShapeDtypeStruct(seen, jnp.float32)]  # fmt: skip
+             jax.ShapeDtypeStruct(shape, jnp.float32)]  # fmt: skip
     call = jax.ffi.ffi_call(TARGET, kinds, vmap_method="sequential")
-    carried, ok, found = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose))
-    return State(*restored(carried), ok=ok), found if vertices else None
+    carried, ok, garment = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose))
+    latent, rotations, positions, translation = restored(carried)
+    return State(latent, rotations, positions, translation, ok), garment if vertices else None

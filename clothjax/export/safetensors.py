@@ -1,4 +1,4 @@
-"""safetensors: the arrays of a model under their names, all else it is in the header, for whoever builds a runtime."""
+"""safetensors, for those who build a runtime: the arrays of a model by name, all else in the header."""
 
 import json
 from pathlib import Path
@@ -10,14 +10,14 @@ import numpy as np
 
 from clothjax.config import Config
 from clothjax.files import configuration, storage
-from clothjax.runtime.inference import NO_KERNEL, Bounds, Layer, Model, Network, Wearer
+from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model, Network, Wearer
 
 FORMAT = 1  # of the file; readers refuse a newer one
-STATIC = ("names", "parents", "kept", "moving")
+STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
 
 
 def to_safetensors(model: Model, path: str | Path) -> Path:
-    """Writes the arrays of a model, as `network.hidden.0.kernel`; what is not an array is JSON in the metadata.
+    """Write the arrays of a model, such as `network.hidden.0.kernel`; all else is JSON in the metadata.
 
     Raises:
         ImportError: if safetensors is not installed.
@@ -27,30 +27,33 @@ def to_safetensors(model: Model, path: str | Path) -> Path:
         jax.tree_util.keystr(where, simple=True, separator="."): np.asarray(leaf, order="C")
         for where, leaf in jax.tree_util.tree_leaves_with_path(model)
     }
-    about = {name: getattr(model, name) for name in STATIC}
+    about = {name: getattr(model, field) for name, field in STATIC.items()}
     about |= {"config": configuration.to_dict(model.config), "format": FORMAT}
     library.numpy.save_file(arrays, str(path), metadata={name: json.dumps(value) for name, value in about.items()})
     return Path(path)
 
 
 def from_safetensors(path: str | Path) -> Model:
-    """The model that `to_safetensors` wrote.
+    """Load the model that `to_safetensors` wrote.
 
     Raises:
-        ValueError: for a file that is not a whole one of these.
+        ValueError: for a file that is damaged or not of this format.
         ImportError: if safetensors is not installed.
     """
     library = _library()
     try:
         with library.safe_open(str(path), framework="numpy") as file:
             about = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
-            arrays: dict[str, Any] = {name: jnp.asarray(file.get_tensor(name)) for name in list(file.keys())}
+            arrays = {name: jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())}  # not a dict
         storage.refuse_newer(path, about.get("format", 1), FORMAT)
         config = configuration.from_dict(Config, about["config"], str(path))
-        static = {name: tuple(about[name]) for name in STATIC}
+        static = {field: tuple(about[name]) for name, field in STATIC.items()}
 
         def layer(name: str) -> Layer:
-            return Layer(arrays.get(f"{name}.kernel", NO_KERNEL), arrays[f"{name}.bias"])
+            return Layer(arrays[f"{name}.kernel"], arrays[f"{name}.bias"])
+
+        def reader(name: str) -> Layer | FoldedLayer:
+            return layer(name) if f"{name}.kernel" in arrays else FoldedLayer(arrays[f"{name}.bias"])
 
         def layers(name: str) -> tuple[Layer, ...]:
             count = sum(key.startswith(f"network.{name}.") and key.endswith(".bias") for key in arrays)
@@ -63,8 +66,8 @@ def from_safetensors(path: str | Path) -> Model:
             **{name: arrays[f"network.{name}"] for name in ("pose", "pose_mean", "first", "shapes", "weights")},
             pose_bounds=bounds("pose_bounds"),
             code_bounds=bounds("code_bounds"),
-            code=layer("network.code"),
-            read=layer("network.read"),
+            code=reader("network.code"),
+            read=reader("network.read"),
             mix=layer("network.mix") if "network.mix.bias" in arrays else None,
             hidden=layers("hidden"),
             decoder=layers("decoder"),

@@ -1,4 +1,4 @@
-"""What an engine programmer must know to drive an exported model, as JSON beside it."""
+"""The JSON beside an exported model, from which an engine programmer learns to drive it."""
 
 import json
 from pathlib import Path
@@ -22,12 +22,12 @@ STATE = {
 
 
 def write(model: Model, path: Path, output: Output, about: dict) -> None:
-    """Writes it beside the file `path` of a model.
+    """Write the JSON beside the file `path` of a model.
 
     Args:
         about: more entries.
     """
-    told = {
+    entries = {
         "garment": model.config.garment,
         "units": "m",
         "up": "+Y",
@@ -43,7 +43,7 @@ def write(model: Model, path: Path, output: Output, about: dict) -> None:
         "faces": np.asarray(model.faces).tolist(),
     } | about
     if output == "canonical":
-        told["skin_joints"] = list(model.moving)
-        told["skin_weights"] = np.round(np.asarray(model.network.weights).T, 5).tolist()
-        told["joint_positions"] = np.asarray(model.wearer.joints).tolist()
-    path.with_suffix(".json").write_text(json.dumps(told))
+        entries["skin_joints"] = list(model.moving)
+        entries["skin_weights"] = np.round(np.asarray(model.network.weights).T, 5).tolist()
+        entries["joint_positions"] = np.asarray(model.wearer.joints).tolist()
+    path.with_suffix(".json").write_text(json.dumps(entries))

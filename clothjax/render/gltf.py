@@ -1,6 +1,7 @@
 """glTF: an animated garment on its body, as morph targets that any viewer plays. NumPy only."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,10 @@ POSITIONS, INDICES = 34962, 34963  # buffer targets
 
 
 def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-3, most: int = 48) -> dict[str, float]:
-    """Writes a binary glTF; returns the largest error in m of each mesh.
+    """Write a binary glTF; return the largest error in m of each mesh.
 
-    Shapes are compressed by principal components into morph targets: as many as keep every vertex within
-    `tolerance` m, but at the most `most`.
+    Shapes are compressed by principal components into morph targets: enough to bring every vertex within `tolerance` m,
+    but at most `most`.
 
     Raises:
         ImportError: if pygltflib is not installed.
@@ -28,7 +29,7 @@ def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-
     frames = np.arange(len(performance.root), dtype=np.float32)
     times = writer.add(frames / np.float32(performance.fps), "SCALAR", bounds=True)
     meshes, materials, nodes, channels, samplers, errors = [], [], [], [], [], {}
-    moved = writer.add(np.asarray(performance.root, np.float32), "VEC3")
+    translations = writer.add(np.asarray(performance.root, np.float32), "VEC3")
     for index, part in enumerate(performance.parts):
         mean, targets, weights, errors[part.name] = principal_components(part.vertices, tolerance, most)
         attributes = gltf.Attributes(
@@ -36,7 +37,7 @@ def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-
             NORMAL=writer.add(vertex_normals(mean, part.faces), "VEC3", POSITIONS),
         )
         corners = writer.add(np.asarray(part.faces, np.uint32).reshape(-1), "SCALAR", INDICES)
-        morphs = [
+        morphs: list[Any] = [  # dicts, which pygltflib writes as they are
             {
                 "POSITION": writer.add(target, "VEC3", POSITIONS, bounds=True),
                 "NORMAL": writer.add(_normal_change(mean, target, part.faces), "VEC3", POSITIONS),
@@ -49,7 +50,7 @@ def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-
         nodes.append(gltf.Node(name=part.name, mesh=index))
         base = gltf.PbrMetallicRoughness(baseColorFactor=[*part.colour, 1.0], metallicFactor=0.0, roughnessFactor=0.9)
         materials.append(gltf.Material(name=part.name, pbrMetallicRoughness=base, doubleSided=True))
-        for values, kind in ((moved, "translation"), (writer.add(weights.reshape(-1), "SCALAR"), "weights")):
+        for values, kind in ((translations, "translation"), (writer.add(weights.reshape(-1), "SCALAR"), "weights")):
             samplers.append(gltf.AnimationSampler(input=times, output=values, interpolation="LINEAR"))
             target = gltf.AnimationChannelTarget(node=index, path=kind)
             channels.append(gltf.AnimationChannel(sampler=len(samplers) - 1, target=target))
@@ -69,13 +70,16 @@ def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-
     return errors
 
 
-def principal_components(vertices: np.ndarray, tolerance: float, most: int):
-    """Mean [N, 3], components [K, N, 3], weights [T, K] and largest vertex error in m of [T, N, 3] m."""
+Components = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+
+
+def principal_components(vertices: np.ndarray, tolerance: float, most: int) -> Components:
+    """Return mean [N, 3], components [K, N, 3], weights [T, K] and largest vertex error in m of [T, N, 3] m."""
     vertices = np.asarray(vertices, np.float64)
     mean = vertices.mean(axis=0)
     left, size, right = np.linalg.svd((vertices - mean).reshape(len(vertices), -1), full_matrices=False)
     weights = left * size
-    count = 0
+    count, error = 0, float("inf")
     for count in range(1, min(most, len(size)) + 1):
         rebuilt = (weights[:, :count] @ right[:count]).reshape(vertices.shape) + mean
         error = float(np.linalg.norm(rebuilt - vertices, axis=-1).max())
@@ -91,19 +95,20 @@ def principal_components(vertices: np.ndarray, tolerance: float, most: int):
 
 
 def _normal_change(mean: np.ndarray, target: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The derivative of the normals along a morph target, by a small step of about a millimetre."""
+    """Return the derivative of the normals along a morph target, by a step of about a millimetre."""
     step = 1e-3 / max(float(np.abs(target).max()), 1e-12)
     change = vertex_normals(mean + step * target, faces) - vertex_normals(mean, faces)
     return (change / step).astype(np.float32)
 
 
 class _Buffer:
-    """The binary part of a glTF under construction."""
+    """Binary part of a glTF under construction."""
 
     def __init__(self, gltf):
         self.gltf, self.data, self.views, self.accessors = gltf, bytearray(), [], []
 
     def add(self, array: np.ndarray, kind: str, target: int | None = None, bounds: bool = False) -> int:
+        """Append an array; return the index of its accessor."""
         array = np.ascontiguousarray(array)
         while len(self.data) % 4:
             self.data += b"\0"

@@ -1,4 +1,4 @@
-"""Moving meshes, as animation programs take them: what `gltf`, `usd` and `point_cache` write."""
+"""Moving meshes for animation programs: the input of `gltf`, `usd` and `point_cache`."""
 
 from typing import NamedTuple
 
@@ -22,5 +22,5 @@ class Performance(NamedTuple):
     fps: float
 
     def placed(self, part: Part) -> np.ndarray:
-        """The vertices [T, N, 3] m of a part in the world, float32."""
+        """Return the vertices [T, N, 3] m of a part in the world, float32."""
         return (np.asarray(part.vertices) + np.asarray(self.root)[:, None]).astype(np.float32)

@@ -1,6 +1,7 @@
-"""Vertex caches of a garment, which Blender, Maya, Houdini, 3ds Max and Cinema 4D play, and OBJ sequences."""
+"""Vertex caches of a garment for Blender, Maya, Houdini, 3ds Max and Cinema 4D, and OBJ sequences."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -10,7 +11,7 @@ from clothjax.render.performance import Part, Performance
 
 
 def to_pc2(path: str | Path, performance: Performance) -> None:
-    """Writes the garment [T, V, 3] m in the world as a Point Cache 2, and NAME_mesh.obj, the mesh to put it on."""
+    """Write the garment [T, V, 3] m in the world as a Point Cache 2, and NAME_mesh.obj, the mesh to put it on."""
     vertices = performance.placed(performance.parts[-1])
     head = b"POINTCACHE2\0" + np.array([1, vertices.shape[1]], "<i4").tobytes()
     head += np.array([0.0, 1.0], "<f4").tobytes() + np.array([len(vertices)], "<i4").tobytes()
@@ -19,7 +20,7 @@ def to_pc2(path: str | Path, performance: Performance) -> None:
 
 
 def to_mdd(path: str | Path, performance: Performance) -> None:
-    """Writes the garment as a Lightwave MDD, and NAME_mesh.obj, the mesh to put it on."""
+    """Write the garment as a Lightwave MDD, and NAME_mesh.obj, the mesh to put it on."""
     vertices = performance.placed(performance.parts[-1])
     head = np.array(vertices.shape[:2], ">i4").tobytes()
     seconds = (np.arange(len(vertices)) / performance.fps).astype(">f4").tobytes()
@@ -28,7 +29,7 @@ def to_mdd(path: str | Path, performance: Performance) -> None:
 
 
 def to_obj(path: str | Path, performance: Performance) -> None:
-    """Writes every frame as an OBJ of its own with all parts: NAME_0000.obj, NAME_0001.obj, ..."""
+    """Write every frame as an OBJ of its own with all parts: NAME_0000.obj, NAME_0001.obj, ..."""
     path = Path(path)
     for t in range(len(performance.root)):
         _mesh(path.with_name(f"{path.stem}_{t:04d}.obj"), performance, t, performance.parts)
@@ -40,8 +41,7 @@ def _rest(path: Path, performance: Performance) -> None:
 
 def _mesh(path: Path, performance: Performance, frame: int, parts: tuple[Part, ...]) -> None:
     root = np.asarray(performance.root)[frame]
-    meshes = {part.name: trimesh.Trimesh(part.vertices[frame] + root, part.faces, process=False) for part in parts}
-    scene = trimesh.Scene()
-    for name, mesh in meshes.items():
-        scene.add_geometry(mesh, geom_name=name)
-    path.write_text(export_obj(scene, include_normals=False, header=""))
+    meshes: dict[str, Any] = {
+        part.name: trimesh.Trimesh(part.vertices[frame] + root, part.faces, process=False) for part in parts
+    }
+    path.write_text(export_obj(trimesh.Scene(meshes), include_normals=False, header=""))

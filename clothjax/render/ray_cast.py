@@ -21,15 +21,19 @@ class Surface(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """The place and direction that a picture is taken from."""
+    """Position and field of view of a camera."""
 
     eye: np.ndarray  # [3] m
     target: np.ndarray  # [3] m
-    height: float  # m seen at the target
+    height: float  # m, the height that is visible at the target
 
 
 def camera_for(vertices: np.ndarray, view: str = "three-quarter", margin: float = 1.12) -> Camera:
-    """A camera that sees all of [..., 3] m, from the `front`, the `back`, the `side` or `three-quarter`s."""
+    """Return a camera that sees all vertices [..., 3] m, from `front`, `back`, `side` or `three-quarter`.
+
+    Raises:
+        ValueError: for another view.
+    """
     angles = {"front": 0.0, "three-quarter": 0.6, "side": np.pi / 2, "back": np.pi}
     if view not in angles:
         raise ValueError(f"view {view!r} is not one of {sorted(angles)}")
@@ -49,9 +53,9 @@ def render(
     floor: float | None = None,
     samples: int = 2,
 ) -> np.ndarray:
-    """A lit picture [h, w, 3] uint8 of surfaces, smooth-shaded, with shadows.
+    """Render a lit picture [h, w, 3] uint8 of surfaces, smooth-shaded, with shadows.
 
-    Visibility is by ray casting, so skin shows through cloth only where it really does.
+    Visibility is by ray casting, so skin shows through cloth only where it really penetrates.
 
     Args:
         size: width and height in pixels.
@@ -63,12 +67,12 @@ def render(
     """
     scene_type, mesh_type = _embree()
     scene = scene_type()
-    normals, offset, colours = [], [], []
+    normals, triangles, colours = [], [], []
     for surface in surfaces:
         vertices = np.ascontiguousarray(surface.vertices, np.float32)
         mesh_type(scene, vertices, np.ascontiguousarray(surface.faces, np.int32))
         normals.append(vertex_normals(vertices, surface.faces))
-        offset.append(surface.faces)
+        triangles.append(surface.faces)
         colours.append(surface.colour)
     width, height = size[0] * samples, size[1] * samples
     origins, directions = _rays(camera, width, height)
@@ -78,7 +82,7 @@ def render(
     points = np.zeros_like(origins)
     normal = np.zeros_like(origins)
     base = np.zeros_like(origins)
-    for index, faces in enumerate(offset):
+    for index, faces in enumerate(triangles):
         chosen = np.flatnonzero(struck & (hit["geomID"] == index))
         corners = np.asarray(faces)[hit["primID"][chosen]]
         u, v = hit["u"][chosen, None], hit["v"][chosen, None]
@@ -112,7 +116,7 @@ def render(
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit normals [N, 3]."""
+    """Return area-weighted unit normals [N, 3]."""
     corners = np.asarray(vertices)[np.asarray(faces)]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     summed = np.zeros((len(vertices), 3), np.float32)
@@ -122,7 +126,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def comparison(path: str | Path | BinaryIO, rows: dict[str, Sequence[np.ndarray]], columns: Sequence[str]) -> None:
-    """A labelled grid of pictures of one size as a PNG: one row a method, one column a moment."""
+    """Write a labelled grid of pictures of one size as a PNG: one row a method, one column a moment."""
     image, draw, font = _pillow("Image", "ImageDraw", "ImageFont")
     height, width = next(iter(rows.values()))[0].shape[:2]
     letters = font.load_default(20)
@@ -139,7 +143,7 @@ def comparison(path: str | Path | BinaryIO, rows: dict[str, Sequence[np.ndarray]
 
 
 def webp(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int = 82) -> None:
-    """An animated WebP of pictures [h, w, 3] uint8, endlessly repeated."""
+    """Write an animated WebP of pictures [h, w, 3] uint8 that repeats endlessly."""
     (image,) = _pillow("Image")
     pictures = [image.fromarray(frame) for frame in frames]
     pictures[0].save(
@@ -154,10 +158,10 @@ def webp(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: in
 
 
 def mp4(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int = 18) -> None:
-    """A film (H.264) of pictures [h, w, 3] uint8 of even size.
+    """Write a film (H.264) of pictures [h, w, 3] uint8 of even size.
 
     Args:
-        quality: the encoder's constant rate factor: 0 without loss, 18 hardly to be told from it, 51 the worst.
+        quality: the encoder's constant rate factor: 0 is lossless, 18 looks lossless, 51 is the worst.
 
     Raises:
         ImportError: if PyAV is not installed.
@@ -177,14 +181,14 @@ def mp4(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int
 
 
 def _shade(scene, points: np.ndarray, normal: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Key light with shadow, fill light, light from the sky."""
+    """Return the colours of points under a key light with shadow, a fill light and light from the sky."""
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
     key, fill = (light / np.linalg.norm(light) for light in (KEY_LIGHT, FILL_LIGHT))
     toward = np.tile(key.astype(np.float32), (len(points), 1))
     start = (points + 4e-3 * normal).astype(np.float32)  # clear of the surface the point is on
     shadow = scene.run(start, toward, query="OCCLUDED")
-    seen = (np.asarray(shadow) < 0).astype(np.float32) if shadow.dtype.kind == "i" else ~shadow.astype(bool)
-    diffuse = np.clip(normal @ key, 0, None) * seen
+    lit = (np.asarray(shadow) < 0).astype(np.float32) if shadow.dtype.kind == "i" else ~shadow.astype(bool)
+    diffuse = np.clip(normal @ key, 0, None) * lit
     soft = 0.5 + 0.5 * np.clip(normal @ fill, -1, 1)
     sky = 0.5 + 0.5 * normal[:, 1]
     return base * (0.72 * diffuse + 0.22 * soft + 0.26 * sky)[:, None]

@@ -2,6 +2,7 @@
 # pyright: reportAttributeAccessIssue=false
 """USD: an animated garment on its body, as meshes with a time sample for every frame."""
 
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,13 @@ from clothjax.render.ray_cast import vertex_normals
 
 
 def to_usd(path: str | Path, performance: Performance) -> None:
-    """Writes a .usdc, or a .usda for people to read: one Xform at the root, under it a mesh for each part.
+    """Write a .usdc, or a .usda that people can read: one Xform at the root, under it a mesh for each part.
 
     Raises:
         ImportError: if usd-core is not installed.
     """
     try:
-        from pxr import Gf, Usd, UsdGeom, Vt
+        Gf, Usd, UsdGeom, Vt = (importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
     except ImportError as error:
         raise ImportError("USD needs usd-core: pip install clothjax[render]") from error
     stage = Usd.Stage.CreateInMemory()
@@ -29,9 +30,9 @@ def to_usd(path: str | Path, performance: Performance) -> None:
     stage.SetEndTimeCode(len(performance.root) - 1)
     character = UsdGeom.Xform.Define(stage, "/character")
     stage.SetDefaultPrim(character.GetPrim())
-    moved = character.AddTranslateOp()
+    translation = character.AddTranslateOp()
     for t, place in enumerate(np.asarray(performance.root, np.float64)):
-        moved.Set(Gf.Vec3d(*place), t)
+        translation.Set(Gf.Vec3d(*place), t)
     for part in performance.parts:
         mesh = UsdGeom.Mesh.Define(stage, f"/character/{part.name}")
         faces = np.asarray(part.faces, np.int32)

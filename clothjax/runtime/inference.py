@@ -1,11 +1,11 @@
 """Psi in use (METHOD.md, Psi): latent predictor -> decoder -> blend shapes -> skinning, one jitted step a frame.
 
-A network knows what it was trained on. So a frame's pose inputs, the wearer's constants and the code are brought into
-the range that they had in training, and a pose that is not finite, or no pose at all, is taken to be the last one:
-whatever comes in, the garment stays finite, and when the input is ordinary again the code forgets the rest within a
-second or two. `State.ok` tells of every frame whether nothing of this was needed.
+A network is reliable only where it was trained. Pose inputs, the character's constants and the code are therefore
+clipped to their range in training. The last pose replaces one that is not finite. The garment stays finite whatever
+comes in, and within a second or two of ordinary input the code forgets the rest. `State.ok` is True for a frame that
+needed none of this.
 
-A model is one wearer's: what betas and material decide is in `Model.wearer`, all else a crowd shares.
+A model belongs to one character: betas and material decide `Model.wearer`, and a crowd shares everything else.
 `clothjax.runtime.specialise.specialise` makes it smaller and faster; it then runs through the same functions.
 """
 
@@ -36,14 +36,20 @@ NO_KERNEL: Any = None  # of the readers of a folded code
 
 
 class Layer(NamedTuple):
-    """A dense layer; without a kernel, what it would make of its input comes with that."""
+    """A dense layer."""
 
-    kernel: Array  # [inputs, outputs]; None where the code is folded (`Network.folded`)
+    kernel: Array  # [inputs, outputs]
+    bias: Array  # [outputs]
+
+
+class FoldedLayer(NamedTuple):
+    """A layer that reads the code of a specialised model: the code carries the product with its kernel."""
+
     bias: Array  # [outputs]
 
 
 class Bounds(NamedTuple):
-    """The range that training has seen, and how far out of it is not worth a word."""
+    """Range seen in training; `slack` is how far outside still counts as inside."""
 
     low: Array
     high: Array
@@ -51,45 +57,45 @@ class Bounds(NamedTuple):
 
 
 class Network(NamedTuple):
-    """Psi from pose inputs [P] and the code [C] to blend shapes [K, 3 V]: what all characters share."""
+    """Psi from pose inputs [P] and the code [C] to blend shapes [K, 3 V]: the part that all characters share."""
 
     pose: Array  # [P, H] kernel of the predictor's first layer
-    pose_mean: Array  # [P] of the inputs, taken from them first
-    pose_bounds: Bounds  # [P] of what is left
-    code: Layer  # [C, H] the same layer's, without the wearer's part of the bias
+    pose_mean: Array  # [P] mean of the inputs, subtracted first
+    pose_bounds: Bounds  # [P] of the centred inputs
+    code: Layer | FoldedLayer  # [C, H] of the same layer, without the character's part of the bias
     hidden: tuple[Layer, ...]  # of the predictor, the last of which gives [C]
     code_bounds: Bounds  # [C]
     first: Array  # [C] the code before the first frame
-    read: Layer  # [C, D] the decoder's first layer, or [C, D + K] with what it gives the weights directly
-    decoder: tuple[Layer, ...]  # its others, to [K]
-    mix: Layer | None  # [K, K'] from its weights to those of fewer shapes
+    read: Layer | FoldedLayer  # [C, D] the decoder's first layer; with a skip [C, D + K], the last K being the skip
+    decoder: tuple[Layer, ...]  # the decoder's other layers, to [K]
+    mix: Layer | None  # [K, K'] from the decoder's weights to those of fewer shapes
     shapes: Array  # [K, 3 V] m, or [K', 3 V], the x of all vertices first; zero where they are pinned
     weights: Array  # [J', V] skinning weights of the joints `Model.moving`
 
     @property
     def folded(self) -> bool:
-        """True if the code is carried as what its two readers make of it: `code` and `read` have no kernels."""
-        return self.code.kernel is None
+        """True if `specialise` has folded the code into the layers around it."""
+        return isinstance(self.code, FoldedLayer)
 
     @property
-    def decoder_width(self) -> int:
-        """Outputs D of `read` that the decoder's other layers take; the rest goes to the weights directly."""
+    def width(self) -> int:
+        """Outputs [D] of the decoder's first layer; further outputs of `read` are the skip."""
         return len(self.decoder[0].kernel)
 
 
 class Wearer(NamedTuple):
-    """The part of a model that the betas and the material of one character decide."""
+    """The arrays that depend on the betas and the material of one character."""
 
     bias: Array  # [H] added to the predictor's first layer
     template: Array  # [3, V] m, the shaped garment in the canonical pose
     joints: Array  # [J, 3] m of the shaped body
-    known: Array  # bool, whether training had such
+    known: Array  # bool, True if the character is within the range of training
 
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=("network", "wearer", "faces"),
-    meta_fields=("names", "parents", "kept", "moving", "config"),
+    meta_fields=("names", "parents", "input_joints", "moving", "config"),
 )
 @dataclasses.dataclass(frozen=True)
 class Model:
@@ -100,7 +106,7 @@ class Model:
     faces: Array  # [F, 3] int32
     names: tuple[str, ...]  # of the joints
     parents: tuple[int, ...]
-    kept: tuple[int, ...]  # joints whose pose is an input
+    input_joints: tuple[int, ...]  # joints whose pose is an input
     moving: tuple[int, ...]  # joints that move the garment
     config: Config
 
@@ -108,11 +114,11 @@ class Model:
 class State(NamedTuple):
     """The state that the model carries from frame to frame."""
 
-    latent: Array  # [C] the code, in standard deviations; of a specialised model what is made of it
+    latent: Array  # [C] the code, in standard deviations; of a folded model its products with the layers that read it
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
     positions: Array  # [2, J, 3] m of their joints, from the root's canonical place
     translation: Array  # [2, 3] m
-    ok: Array  # bool, whether the last frame was within the range of training
+    ok: Array  # bool, True if the last frame was within the range of training
 
 
 def build(
@@ -127,15 +133,23 @@ def build(
     betas: Array | None = None,
     material: Material | None = None,
 ) -> Model:
-    """A model of one character; `betas` [S] default to the mean body, the material to the configured one.
+    """Build the model of one character.
 
-    Scales and constants of the inputs are taken into the layers that read them.
+    Scales and constants of the inputs are folded into the layers that read them.
+
+    Args:
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: for betas of another shape than the body's.
     """
     betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
     if betas.shape != (body.shapedirs.shape[-1],):
         raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
-    material = configured_material(config) if material is None else material
-    material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
+    cloth = config.material
+    constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
+    material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
     network, wearer = _arrays(garment, body, garment_params, predictor, normalizers, betas, material, config)
     return Model(
         network=network,
@@ -143,7 +157,7 @@ def build(
         faces=jnp.asarray(garment.faces),
         names=tuple(names),
         parents=tuple(int(p) for p in body.parents),
-        kept=tuple(int(k) for k in psi.input_joints(names, config.stage2)),
+        input_joints=tuple(int(joint) for joint in psi.input_joints(names, config.stage2)),
         moving=tuple(range(len(names))),
         config=config,
     )
@@ -160,7 +174,7 @@ def _arrays(
     material: Material,
     config: Config,
 ) -> tuple[Network, Wearer]:
-    """The arrays of a model, all in one program: it starts in a fraction of the time that one by one they take."""
+    """Build the arrays of a model in one compiled program, which starts faster than many small ones."""
     constants, known = psi.bounded_constants(psi.constant_inputs(betas, material, config.material), config)
     latent, pose = normalizers
     size = len(latent.mean)
@@ -202,13 +216,13 @@ def _layers(mlp: dict) -> list[Layer]:
 
 
 def crowd(models: Sequence[Model]) -> Model:
-    """One model of many characters in the same garment, for `step_crowd`.
+    """Build one model of many characters in the same garment, for `step_crowd`.
 
     Args:
-        models: of different wearers, otherwise the same.
+        models: of different characters, otherwise the same.
 
     Raises:
-        ValueError: if there is none, or one differs from the first in more than its wearer.
+        ValueError: if there is none, or one differs from the first in more than its character.
     """
     if not models:
         raise ValueError("a crowd needs at least one model")
@@ -220,33 +234,33 @@ def crowd(models: Sequence[Model]) -> Model:
         if not same:
             raise ValueError(
                 f"models[{number}] differs from models[0] in more than its wearer: a crowd is of one garment, and of "
-                "models whose blend shapes `specialise` has not fitted to their wearers"
+                "models whose blend shapes `specialise` has not fitted to their characters"
             )
     wearers = jax.tree.map(lambda *each: jnp.stack(each), *(model.wearer for model in models))
     return dataclasses.replace(models[0], wearer=wearers)
 
 
 def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
-    """The model of a finished run, or a garment that comes with the library.
+    """Load the model of a finished run, or of a garment that comes with the library.
 
     Args:
-        run: the folder of a run or of a packed model, or a name of `trained.shipped()`, as "skirt".
+        run: the folder of a run or of a packed model, or a name from `trained.shipped()`, such as "skirt".
         betas: [S] body shape; default the mean body.
         material: default the configured one.
 
     Raises:
         ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
     """
-    config, garment, predictor, normalizers = trained.psi(trained.find(run))
-    body = storage.load_body(config.body)
+    run_psi = trained.psi(trained.find(run))
+    body = storage.load_body(run_psi.config.body)
     return build(
-        config,
-        storage.load_garment(config.garment, body),
+        run_psi.config,
+        storage.load_garment(run_psi.config.garment, body),
         body,
-        storage.joint_names(config.body),
-        garment,
-        predictor,
-        normalizers,
+        storage.joint_names(run_psi.config.body),
+        run_psi.garment,
+        run_psi.predictor,
+        run_psi.normalizers,
         betas=betas,
         material=material,
     )
@@ -254,9 +268,9 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
 
 @jax.jit
 def initial_state(model: Model, pose: Pose) -> State:
-    """The state before the first frame: the code is zero and the character has been standing in `pose`.
+    """Return the state before the first frame: a code of zero, and a character that has been standing in `pose`.
 
-    The canonical pose takes the place of one that is not finite.
+    The canonical pose replaces one that is not finite.
     """
     pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
     still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
@@ -274,21 +288,21 @@ def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
 
 @partial(jax.jit, static_argnames="vertices")
 def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
-    """The next frame: a new state, and the garment's vertices [V, 3] m in the world.
+    """Compute the next frame: a new state, and the garment's vertices [V, 3] m in the world.
 
     Args:
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
-        vertices: False for a garment that nobody sees: then the state goes on, and there are no vertices.
+        vertices: False for a garment that nobody sees: only the state goes on, and the vertices are None.
     """
     network, wearer, parents = model.network, model.wearer, np.array(model.parents)
     pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
-    turns, places = skinning.forward_kinematics(pose.rotations, wearer.joints, parents)
+    global_rotations, joints = skinning.forward_kinematics(pose.rotations, wearer.joints, parents)
     rotations, positions, translation = (
         jnp.concatenate([new[None], old])
-        for new, old in zip((pose.rotations, places, pose.translation), state[1:4], strict=True)
+        for new, old in zip((pose.rotations, joints, pose.translation), state[1:4], strict=True)
     )
     advance = translation[:2] - translation[1:]
-    inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.kept), model.config.fps)
+    inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.input_joints), model.config.fps)
     inputs, ordinary = normalisation.bounded(inputs - network.pose_mean, *network.pose_bounds)
     latent, inside = normalisation.bounded(
         predict(network, state.latent, inputs, wearer.bias, model.config), *network.code_bounds
@@ -298,37 +312,37 @@ def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple
     if not vertices:
         return following, None
     displaced = jnp.matmul(blend_weights(network, latent, model.config), network.shapes, precision=HIGHEST)
-    transforms = skinning.bound_transforms(turns, places, wearer.joints)
+    transforms = skinning.bound_transforms(global_rotations, joints, wearer.joints)
     garment = wearer.template + displaced.reshape(3, -1)
     return following, _skin(garment, network.weights, transforms[np.array(model.moving)], pose.translation)
 
 
 def predict(network: Network, latent: Array, inputs: Array, bias: Array, config: Config) -> Array:
-    """The next code [C] from the current one, pose inputs [P] and the wearer's part [H] of the first layer."""
-    kernel, common = network.code
-    x = inputs @ network.pose + (latent[: len(bias)] if network.folded else latent @ kernel) + common + bias
-    for kernel, bias in network.hidden:
-        x = jax.nn.relu(x) @ kernel + bias
+    """Return the next code [C] from the current one, pose inputs [P] and the character's part [H] of the bias."""
+    code = network.code
+    x = latent @ code.kernel if isinstance(code, Layer) else latent[: len(bias)]
+    x = inputs @ network.pose + x + code.bias + bias
+    for layer in network.hidden:
+        x = jax.nn.relu(x) @ layer.kernel + layer.bias
     return (1.0 - config.stage2.latent_decay) * latent + x
 
 
 def blend_weights(network: Network, latent: Array, config: Config) -> Array:
-    """Weights of `Network.shapes` of a code [C]."""
-    kernel, bias = network.read
-    read = bias + (latent[-len(bias) :] if network.folded else latent @ kernel)
-    wide = network.decoder_width
-    x, beside = read[:wide], read[wide:]
-    for kernel, bias in network.decoder:
-        x = jax.nn.relu(x) @ kernel + bias
-    weights = x + beside if config.model.decoder_skip else x
+    """Return the weights of `Network.shapes` for a code [C]."""
+    read = network.read
+    product = latent @ read.kernel if isinstance(read, Layer) else latent[-len(read.bias) :]
+    x, skip = jnp.split(read.bias + product, [network.width])
+    for layer in network.decoder:
+        x = jax.nn.relu(x) @ layer.kernel + layer.bias
+    weights = x + skip if config.model.decoder_skip else x
     weights = jax.nn.relu(weights) if config.model.blendshape_relu else weights
     return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
 
 
 def _skin(garment: Array, weights: Array, transforms: Array, translation: Array) -> Array:
-    """Vertices [V, 3] m of a garment [3, V] skinned by the transforms [J', 3, 4] of joints with weights [J', V].
+    """Skin a garment [3, V] by the transforms [J', 3, 4] of joints with weights [J', V]; return vertices [V, 3] m.
 
-    Coordinate by coordinate: long rows are what a processor is fast at.
+    It works coordinate by coordinate, because processors are fast at long rows.
     """
     flat = transforms.reshape(-1, 12).T
     rows = jnp.matmul(flat, weights, precision=HIGHEST).reshape(3, 4, -1)
@@ -338,7 +352,7 @@ def _skin(garment: Array, weights: Array, transforms: Array, translation: Array)
 
 @jax.jit
 def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
-    """Return bool: True if a step has changed nothing, so that none need be taken until the pose changes.
+    """Return whether a step changed nothing: until the pose changes, no further step is needed.
 
     Args:
         before, after: the states around the step.
@@ -350,23 +364,26 @@ def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
 
 @jax.jit
 def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
-    """`step` for every character of a `crowd`: states and poses have a leading axis [N], and so have the vertices."""
+    """Take a `step` for every character of a `crowd`: states, poses and vertices have a leading axis [N]."""
+    return jax.vmap(partial(step, vertices=True), (_axes(model), 0, 0))(model, states, poses)
 
     def one(wearer: Wearer, state: State, pose: Pose) -> tuple[State, Array]:
         state, vertices = step(dataclasses.replace(model, wearer=wearer), state, pose, vertices=True)
         assert vertices is not None
         return state, vertices
 
-    return jax.vmap(one)(model.wearer, states, poses)
+def _axes(model: Model) -> Model:
+    """Return the axes of a crowd's model to map over: only the character has one."""
+    return dataclasses.replace(model, network=None, faces=None, wearer=0)
 
 
 def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
-    """A whole motion: vertices [T, V, 3] m in the world, and `ok` [T], as in `State`, of each frame.
+    """Animate a whole motion: vertices [T, V, 3] m in the world, and `State.ok` [T] of each frame.
 
     The first frame is the garment settled on the standing first pose.
 
     Raises:
-        ValueError: for a motion of another number of joints, or frames a second, than the model's.
+        ValueError: if the number of joints or frames a second of the motion is not the model's.
     """
     if motion.rotations.shape[1] != len(model.names):
         raise ValueError(f"the motion has {motion.rotations.shape[1]} joints, the garment's body {len(model.names)}")

@@ -1,6 +1,6 @@
 """Psi made smaller and faster for one use (METHOD.md, Psi): exactly, or at the price of an error to be measured.
 
-All of these take a model of `inference` and give another, which runs through the same functions.
+Every function takes a model of `inference` and returns another, which runs through the same functions.
 """
 
 import dataclasses
@@ -12,25 +12,25 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.files import storage
 from clothjax.geometry import proximity
-from clothjax.runtime.inference import NO_KERNEL, Bounds, Layer, Model, Network, blend_weights, initial_state, step
+from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model, Network, blend_weights, initial_state, step
 from clothjax.types import Array, Garment, Motion, Pose
 
-FOLD_RATIO = 0.75  # of the weights of the layers around the code, that folding it away must leave at the most
-CALIBRATION_CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # that tell which displacements occur
-UNSEEN_VARIANCE = 1e-3  # of the mean variance of blend-shape weights: that of those that do not vary there
-CALIBRATION_CODES = 2048  # codes that do, where these do not fit
+FOLD_RATIO = 0.75  # folding must leave at most this part of the weights of the layers around the code
+CALIBRATION_CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # give the usual displacements
+CALIBRATION_CODES = 2048  # random codes, for a body that the clips do not fit
+UNSEEN_VARIANCE = 1e-3  # assumed of weights that do not vary in the clips, relative to the mean variance
 
 
 def specialise(model: Model, *, blendshapes: int | None = None, max_influences: int | None = None) -> Model:
-    """The model with nothing in it that its use does not need.
+    """Return the model reduced to what its use needs.
 
-    Exact are: the code is carried as what the two layers that read it make of it, where that takes much fewer weights;
-    joints that move no vertex are not asked. (A code outside the range of training is then held only to what that
-    range becomes, and `State.ok` may not tell it.) The arguments are lossy.
+    Two reductions are exact. The code is folded into the two layers that read it, where that takes much fewer weights.
+    Joints that move no vertex are left out. (A folded code outside the range of training is clipped only to the image
+    of that range, and `State.ok` may stay True.) The arguments ask for lossy reductions.
 
     Args:
-        blendshapes: so many, fitted to those there are.
-        max_influences: joints that move a vertex, at the most.
+        blendshapes: number of blend shapes, fitted to the present ones.
+        max_influences: largest number of joints that move a vertex.
 
     Raises:
         ValueError: for a number that is not at least 1.
@@ -48,14 +48,14 @@ def specialise(model: Model, *, blendshapes: int | None = None, max_influences: 
 
 
 def without_code(model: Model) -> Model:
-    """The model with the code folded into the layers before and behind it, if these then have much fewer weights.
+    """Return the model with the code folded into the layers around it, if these then have much fewer weights.
 
-    The code is given by a linear layer and read by two: the predictor's first in the next frame, and the decoder's.
+    A linear layer gives the code and two layers read it: the predictor's first in the next frame, and the decoder's.
     """
-    network = model.network
-    if network.folded:
+    network, code, read = model.network, model.network.code, model.network.read
+    if isinstance(code, FoldedLayer) or isinstance(read, FoldedLayer):
         return model
-    readers = jnp.concatenate([network.code.kernel, network.read.kernel], axis=1)
+    readers = jnp.concatenate([code.kernel, read.kernel], axis=1)
     *hidden, last = network.hidden
     folded = Layer(_product(last.kernel, readers), _product(last.bias, readers))
     if folded.kernel.size > FOLD_RATIO * (last.kernel.size + readers.size):
@@ -63,63 +63,81 @@ def without_code(model: Model) -> Model:
     low, high, slack = network.code_bounds
     middle, radius = _product(0.5 * (low + high), readers), _product(0.5 * (high - low), jnp.abs(readers))
     network = network._replace(
-        code=Layer(NO_KERNEL, network.code.bias),
+        code=FoldedLayer(code.bias),
         hidden=(*hidden, folded),
         code_bounds=Bounds(middle - radius, middle + radius, _product(slack, jnp.abs(readers))),
         first=_product(network.first, readers),
-        read=Layer(NO_KERNEL, network.read.bias),
+        read=FoldedLayer(read.bias),
     )
     return dataclasses.replace(model, network=network)
 
 
-def smoothed(model: Model) -> Model:
-    """Return the same model with code and blend shapes scaled by `smoothing_scale`, for runtimes that quantise all
-    inputs of a layer alike."""
-    network = model.network
-    largest = np.abs(ordinary_weights(model)).max(axis=0)
-    of_shapes = smoothing_scale(largest, network.shapes)
+def equalised(model: Model) -> Model:
+    """Return the same model with blend shapes and code scaled by `smoothing_scale`.
+
+    It is for runtimes that quantise all inputs of a layer alike.
+    """
+    network = _equalised_shapes(model.network, np.abs(ordinary_weights(model)).max(axis=0))
+    return dataclasses.replace(model, network=_equalised_code(network))
+
+
+def _equalised_shapes(network: Network, limits: np.ndarray) -> Network:
+    """Return the network with blend shapes scaled, given the largest weight `limits` [K] of each."""
+    scale = smoothing_scale(limits, network.shapes)
+    shapes = network.shapes * scale[:, None]
+    if network.mix is not None:
+        mix = Layer(network.mix.kernel / scale[None], network.mix.bias / scale)
+        return network._replace(mix=mix, shapes=shapes)
     *decoder, last = network.decoder
-    wide, mix, read = network.decoder_width, network.mix, network.read
-    if mix is not None:
-        mix = Layer(mix.kernel / of_shapes[None], mix.bias / of_shapes)
-    else:
-        last = Layer(last.kernel / of_shapes[None], last.bias / of_shapes)
-        beside = np.concatenate([np.ones(wide), of_shapes])[: len(read.bias)]
-        read = Layer(read.kernel if network.folded else read.kernel / beside[None], read.bias / beside)
-    if network.folded:  # the code is what the readers make of it: here of `read`, at its end
-        scale = np.ones(len(network.first), np.float32)
-        if mix is None:
-            scale[-len(read.bias) :] = beside
-    else:
-        limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
-        scale = smoothing_scale(limits, jnp.concatenate([network.code.kernel, read.kernel], axis=1))
-        read = read._replace(kernel=read.kernel * scale[:, None])
-        network = network._replace(code=network.code._replace(kernel=network.code.kernel * scale[:, None]))
-    *hidden, final = network.hidden
-    network = network._replace(
-        hidden=(*hidden, Layer(final.kernel / scale[None], final.bias / scale)),
+    read = network.read
+    of_read = np.concatenate([np.ones(network.width), scale])[: len(read.bias)]  # the skip gives weights directly
+    if isinstance(read, Layer):
+        read = Layer(read.kernel / of_read[None], read.bias / of_read)
+    else:  # the code ends with the product that `read` adds its bias to
+        read = FoldedLayer(read.bias / of_read)
+        of_code = np.ones(len(network.first), np.float32)
+        of_code[-len(of_read) :] = of_read
+        network = _divided_code(network, of_code)
+    decoder = (*decoder, Layer(last.kernel / scale[None], last.bias / scale))
+    return network._replace(read=read, decoder=decoder, shapes=shapes)
+
+
+def _equalised_code(network: Network) -> Network:
+    """Return the network with its code scaled; a folded one as it is."""
+    code, read = network.code, network.read
+    if isinstance(code, FoldedLayer) or isinstance(read, FoldedLayer):
+        return network
+    limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
+    scale = smoothing_scale(limits, jnp.concatenate([code.kernel, read.kernel], axis=1))
+    return _divided_code(network, scale)._replace(
+        code=code._replace(kernel=code.kernel * scale[:, None]), read=read._replace(kernel=read.kernel * scale[:, None])
+    )
+
+
+def _divided_code(network: Network, scale: np.ndarray) -> Network:
+    """Return the network that gives its code divided by `scale` [C]; the layers that read it stay."""
+    *hidden, last = network.hidden
+    return network._replace(
+        hidden=(*hidden, Layer(last.kernel / scale[None], last.bias / scale)),
         code_bounds=Bounds(*(row / scale for row in network.code_bounds)),
         first=network.first / scale,
-        read=read,
-        decoder=(*decoder, last),
-        mix=mix,
-        shapes=network.shapes * of_shapes[:, None],
     )
-    return dataclasses.replace(model, network=network)
 
 
 def smoothing_scale(limits: Array, kernel: Array) -> np.ndarray:
-    """Return the scale [n] that balances inputs against weights before int8 (SmoothQuant, Xiao et al. 2023).
+    """Return a scale [n] that balances inputs against weights before int8 (SmoothQuant, Xiao et al. 2023).
 
-    Inputs that reach to `limits` [n] are divided by it, and the rows of their kernel [n, m] multiplied: eight bits are
-    shared by all of a row, so neither may be small beside the others.
+    Divide the inputs [n] by it and multiply the rows of their kernel [n, m]: all of a row share eight bits.
+
+    Args:
+        limits: [n] largest magnitude of each input.
     """
     weights = np.abs(np.asarray(kernel)).max(axis=1)
     return np.sqrt(np.maximum(limits, 1e-6) / np.maximum(weights, 1e-6)).astype(np.float32)
 
 
 def part(model: Model, vertices: Array) -> Model:
-    """The model of some vertices [n] of its garment, as those that are not hidden; of its faces those they make up."""
+    """Return the model of some vertices [n] of its garment, such as the visible ones, with the faces among them."""
     vertices = np.unique(np.asarray(vertices))
     number = np.full(model.wearer.template.shape[-1], -1)
     number[vertices] = np.arange(len(vertices))
@@ -137,16 +155,16 @@ def part(model: Model, vertices: Array) -> Model:
 
 
 def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
-    """The model on another mesh of the same garment, finer or coarser: a level of detail.
+    """Return the model on another mesh of the same garment, finer or coarser: a level of detail.
 
-    A vertex of it is displaced as the place of the model's own mesh that it is nearest to.
+    Each vertex takes the displacement of the nearest point of the model's own mesh.
 
     Args:
-        model: as it was loaded; what comes of it can be specialised.
-        betas: [S] of the model's wearer.
+        model: as it was loaded; the result can be specialised.
+        betas: [S] of the model's character.
 
     Raises:
-        ValueError: for a model that was specialised: the mesh may need what that has left out.
+        ValueError: for a specialised model, because the mesh may need the parts that are gone.
     """
     if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
         raise ValueError("this model is specialised already: put it on the other mesh first")
@@ -171,7 +189,10 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
 
 
 def ordinary_weights(model: Model) -> np.ndarray:
-    """Blend-shape weights [n, K] of rollouts over embedded clips; of random codes, for a body they do not fit."""
+    """Return blend-shape weights [n, K] of autoregressive rollouts over the calibration clips.
+
+    They come from random codes for a body that the clips do not fit.
+    """
     limits = model.network.code_bounds
     try:
         clips = [storage.load_motion(name, model.names) for name in CALIBRATION_CLIPS]
@@ -184,7 +205,7 @@ def ordinary_weights(model: Model) -> np.ndarray:
 
 @jax.jit
 def _codes(model: Model, motion: Motion) -> Array:
-    """Return the codes [T, C] of a rollout."""
+    """Return the codes [T, C] of an autoregressive rollout."""
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
 
     def frame(state, pose):
@@ -203,45 +224,47 @@ def _rows(network: Network) -> Array:
 
 
 def _fewer_shapes(model: Model, count: int) -> Model:
-    """Principal components of ordinary displacements in the place of the blend shapes; their mean goes into the
-    template."""
-    mix, shapes, moved = principal_rows(ordinary_weights(model), np.asarray(model.network.shapes), count)
+    """Replace the blend shapes by principal components of ordinary displacements; their mean goes into the template."""
+    mix, shapes, mean = principal_rows(ordinary_weights(model), np.asarray(model.network.shapes), count)
     network = model.network._replace(shapes=jnp.asarray(shapes))
-    template = model.wearer.template + jnp.asarray(moved).reshape(3, -1)
+    template = model.wearer.template + jnp.asarray(mean).reshape(3, -1)
     network = network._replace(mix=mix) if model.config.model.blendshape_relu else _mixed(network, mix)
     return dataclasses.replace(model, network=network, wearer=model.wearer._replace(template=template))
 
 
 def principal_rows(weights: np.ndarray, shapes: np.ndarray, count: int) -> tuple[Layer, np.ndarray, np.ndarray]:
-    """Fewer rows in the place of blend shapes [K, N], the best for weights [n, K] that occur: the layer that gives
-    their weights, themselves [count, N], and what is to be added [N]."""
+    """Replace blend shapes [K, N] by fewer rows, the best for weights [n, K] that occur.
+
+    Returns:
+        The layer [K, count] that gives the weights of the rows, the rows [count, N], and an offset [N] to be added.
+    """
     weights = weights.astype(np.float64)
     mean, spread = weights.mean(axis=0), np.cov(weights.T)
     root = np.linalg.cholesky(spread + UNSEEN_VARIANCE * np.trace(spread) / len(mean) * np.eye(len(mean)))
     # weights are mean + u root^T with isotropic u: the rows that serve u best are principal in root^T shapes
     unmixed = root.T @ shapes.astype(np.float64)
     chosen = np.linalg.eigh(unmixed @ unmixed.T)[1][:, -count:]
-    # in coordinates that are not large and cancelled by others: eight bits could not hold these
-    turned, upper = np.linalg.qr(np.linalg.solve(root.T, chosen))
+    # in orthogonal coordinates: eight bits could not hold large ones that cancel each other
+    basis, upper = np.linalg.qr(np.linalg.solve(root.T, chosen))
     rows = upper @ chosen.T @ unmixed
     axes = np.linalg.eigh(rows @ rows.T)[1]
-    mixing = turned @ axes
+    mixing = basis @ axes
     mix = Layer(*(jnp.asarray(x, jnp.float32) for x in (mixing, -mean @ mixing)))
     return mix, (axes.T @ rows).astype(np.float32), (mean @ shapes).astype(np.float32)
 
 
 def _mixed(network: Network, mix: Layer) -> Network:
-    """The decoder with a linear layer behind it folded in."""
+    """Return the network, not folded, with a linear layer `mix` folded into the end of its decoder and its skip."""
     *others, last = network.decoder
-    wide = network.decoder_width
+    width, read = network.width, network.read
 
-    def beside(rows: Array) -> Array:
-        return jnp.concatenate([rows[..., :wide], _product(rows[..., wide:], mix.kernel)], axis=-1)
+    def mixed_skip(rows: Array) -> Array:
+        return jnp.concatenate([rows[..., :width], _product(rows[..., width:], mix.kernel)], axis=-1)
 
-    return network._replace(
-        decoder=(*others, Layer(_product(last.kernel, mix.kernel), _product(last.bias, mix.kernel) + mix.bias)),
-        read=network.read if network.read.kernel.shape[1] == wide else Layer(*(beside(x) for x in network.read)),
-    )
+    if isinstance(read, Layer) and len(read.bias) > width:
+        read = Layer(mixed_skip(read.kernel), mixed_skip(read.bias))
+    last = Layer(_product(last.kernel, mix.kernel), _product(last.bias, mix.kernel) + mix.bias)
+    return network._replace(decoder=(*others, last), read=read)
 
 
 def _fewer_influences(model: Model, count: int) -> Model:

@@ -1,8 +1,8 @@
 """Trained models: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
-A packed model is a folder with `model.npz` and `config.yaml`, and `report.json` where that says how it was made. Large
-matrices are kept in eight bits with a scale for each column (`NAME` and `NAME|scale`), the blend shapes and the
-preconditioner in half precision, all else as it is.
+A packed model is a folder with `model.npz` and `config.yaml`; a `report.json` may say how it was trained. Large
+matrices are stored in eight bits with a scale for each column (`NAME` and `NAME|scale`). The blend shapes and the
+preconditioner are in half precision, all else as it is.
 """
 
 import json
@@ -21,20 +21,29 @@ from clothjax.types import Material
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
-HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # their errors would be felt: strain, a worse descent
-FORMAT = 2  # of a packed model; in 1 no number was written, all else is the same
-LARGE = 2000  # entries of a matrix that is worth eight bits
+HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # eight bits would strain the cloth, slow the descent
+FORMAT = 2  # of a packed model; 1 is the same without a number
+LARGE = 2000  # entries from which a matrix is stored in eight bits
+
+
+class TrainedPsi(NamedTuple):
+    """Psi as it was trained, with the configuration of its last stage."""
+
+    config: Config
+    garment: dict  # the decoder with its blend shapes
+    predictor: dict  # the latent predictor, after its last stage
+    normalizers: Normalizers
 
 
 def shipped() -> tuple[str, ...]:
-    """Names of the garments that come with the library."""
+    """Return the names of the garments that come with the library."""
     return tuple(sorted(path.parent.name for path in MODELS.glob(f"*/{WEIGHTS}")))
 
 
 def find(model: str | Path) -> Path:
-    """The folder of a model: of a run, of a packed model, or of a garment that comes with the library, by its name.
+    """Return the folder of a model: a run, a packed model, or a garment of the library by its name.
 
-    A garment of the library comes before a folder that is called the same, which is found as `./skirt`.
+    A garment of the library comes before a folder of the same name, which is found as `./skirt`.
 
     Raises:
         ValueError: if there is no such folder and no such garment.
@@ -53,7 +62,7 @@ def folder(name: str) -> Path:
     """Return the folder of a garment that comes with the library.
 
     Raises:
-        ValueError: for a name that is none.
+        ValueError: if there is no garment of that name.
     """
     if name not in shipped():
         raise ValueError(f"no garment called {name!r} comes with clothjax; there are: {', '.join(shipped()) or 'none'}")
@@ -61,10 +70,10 @@ def folder(name: str) -> Path:
 
 
 def phi(run: str | Path) -> tuple[Config, dict]:
-    """The configuration and the `params` and `statistics` of Phi, of a run or a packed model.
+    """Load the configuration and the `params` and `statistics` of Phi, from a run or a packed model.
 
     Raises:
-        ValueError: if there is no readable one, as of a baseline's run.
+        ValueError: if there is no readable Phi, as in a baseline's run.
     """
     config, model = network(run)
     if config.peer.network:
@@ -76,7 +85,7 @@ def phi(run: str | Path) -> tuple[Config, dict]:
 
 
 def network(run: str | Path) -> tuple[Config, dict]:
-    """Return the same as `phi`, or a baseline's network in its place.
+    """Load the same as `phi`, or a baseline's network in the place of Phi.
 
     Raises:
         ValueError: if there is no readable one.
@@ -92,17 +101,8 @@ def network(run: str | Path) -> tuple[Config, dict]:
     return config, {"params": params, "statistics": statistics}
 
 
-class TrainedPsi(NamedTuple):
-    """All that Psi is after its training."""
-
-    config: Config
-    garment: dict  # parameters of the decoder, with its blend shapes
-    predictor: dict  # after all that trained it
-    normalizers: Normalizers  # of Psi without stage 1, they change nothing
-
-
 def psi(run: str | Path) -> TrainedPsi:
-    """Read Psi of a run or a packed model.
+    """Load Psi from a run or a packed model. For Psi without stage 1 the normalizers are identities.
 
     Raises:
         ValueError: if there is no readable one.
@@ -132,40 +132,40 @@ def psi(run: str | Path) -> TrainedPsi:
 
 
 def packed(run: str | Path) -> bool:
-    """True for a folder of a packed model."""
+    """Return whether a folder holds a packed model."""
     return (Path(run) / WEIGHTS).is_file()
 
 
-def made(packed: str | Path) -> dict[str, Any]:
-    """Return how a packed model was made: the `command`, `seed` and `hours` that its report knows."""
+def provenance(packed: str | Path) -> dict[str, Any]:
+    """Return the `command`, `seed` and `hours` of a packed model's training, those that its report names."""
     path = Path(packed) / REPORT
     report = json.loads(path.read_text()) if path.is_file() else {}
     return {name: report[name] for name in ("command", "seed", "hours") if name in report}
 
 
 def pack(run: str | Path, out: str | Path) -> int:
-    """Writes a finished run as a packed model; returns the bytes of its weights.
+    """Write a finished run as a packed model; return the bytes of its weights.
 
     Raises:
         ValueError: if the run is not finished, or Psi was trained on another Phi than the run now has.
     """
     config, model = phi(run)
-    _, garment, predictor, normalizers = psi(run)
+    student = psi(run)
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
         if done != wanted:
             raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
     decoder = checkpoint.named(model["params"]["garment"])
-    if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(garment).items()):
+    if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(student.garment).items()):
         raise ValueError(
             f"{run}: stage 1 was trained further after stage 2: remove its {', '.join(STAGES[1:])}, and train again"
         )
-    return write(out, config, model, predictor, normalizers)
+    return write(out, config, model, student.predictor, student.normalizers)
 
 
 def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalizers: Normalizers) -> int:
-    """Writes a packed model; returns the bytes of its weights.
+    """Write a packed model; return the bytes of its weights.
 
     Args:
         phi: `params` and `statistics`.
@@ -209,7 +209,7 @@ def _normalizers(parts: dict[str, dict]) -> Normalizers:
 
 
 def _config(run: Path) -> Config:
-    """The configuration of a run's last stage: those before may have been trained with other settings of later ones."""
+    """Load the configuration of a run's last stage; earlier ones may hold other settings of later stages."""
     first, *later = (run / stage / "checkpoints" for stage in STAGES)
     last = [first, *(folder for folder in later if checkpoint.steps(folder))][-1]
     return configuration.from_dict(Config, checkpoint.latest(last).config, str(last))

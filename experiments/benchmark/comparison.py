@@ -1,6 +1,6 @@
-"""Two reports of the benchmark beside each other: what has become slower or faster by more than noise.
+"""Two reports of the benchmark side by side: the times that changed by more than noise.
 
-The noise is that of medians: what was measured once, as a compilation or a rollout of Phi, may differ by more.
+The noise is that of medians. Times measured once, such as a compilation or a rollout of Phi, may differ by more.
 """
 
 import math
@@ -11,7 +11,7 @@ TIMES = {"us", "ms", "seconds"}
 
 
 def compare(new: dict, old: dict) -> dict:
-    """Ratios of times, new over old, by place in the report, and which of them the noise of both does not explain."""
+    """Return ratios of times, new over old, by place in the report, and those beyond the noise of both."""
     result = {"other_machine": [key for key in new["machine"] if new["machine"][key] != old["machine"].get(key)]}
     for part in (key for key in new if key in old and key != "machine"):
         here, there = times(new[part]), times(old[part])
@@ -28,8 +28,7 @@ def compare(new: dict, old: dict) -> dict:
 
 
 def times(part, place: str = "", timed: bool = False) -> dict[str, float]:
-    """The times of a report, by their place in it: what has a unit of time in its name, or in the name of the table it
-    is in."""
+    """Return the times of a report by their place in it: entries with a unit of time in their name or their table's."""
     if isinstance(part, dict):
         found = {}
         for key, value in part.items():
@@ -49,7 +48,7 @@ def times(part, place: str = "", timed: bool = False) -> dict[str, float]:
 
 
 def lines(compared: dict) -> list[str]:
-    """The comparison for a reader."""
+    """Return the comparison as readable lines."""
     found = []
     if compared["other_machine"]:
         found.append(f"not the same machine as then: {', '.join(compared['other_machine'])} differ")

@@ -23,7 +23,7 @@ from clothjax.runtime import inference, specialise
 from clothjax.runtime.inference import Model
 from clothjax.simulation import assembly
 from clothjax.types import Motion, Pose
-from experiments.benchmark import peers, timing
+from experiments.benchmark import baselines, timing
 from experiments.benchmark.timing import Call
 
 matplotlib.use("Agg")
@@ -38,7 +38,7 @@ NEAR = 1.0  # mm, the error that is put up with
 
 
 def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS) -> dict:
-    """The figures: those against NCS at the paper's size, those of a garment of the library, floors and variants."""
+    """Measure Psi against NCS at the paper's size, and the variants of a garment of the library."""
     with tempfile.TemporaryDirectory() as folder:
         shipped = _shipped(Path(folder), rounds, frames)
         errors = {variant["name"]: variant["error_mm"] for variant in shipped["variants"]}
@@ -52,11 +52,11 @@ def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS)
 
 
 def paper_model() -> Model:
-    """Psi at the size of the thesis on the 4 000-vertex t-shirt, with random weights."""
+    """Build Psi at the size of the thesis on the 4 000-vertex t-shirt, with random weights."""
     config = configuration.cli(Config, PAPER)
     experiment = assembly.assemble(config)
-    kept = psi.input_joints(experiment.names, config.stage2)
-    size, count = config.model.latent, 6 + 18 * len(kept) + 9 * (len(kept) - 1)
+    input_joints = psi.input_joints(experiment.names, config.stage2)
+    size, count = config.model.latent, 6 + 18 * len(input_joints) + 9 * (len(input_joints) - 1)
     random = np.random.default_rng(0)
     basis = 1e-3 * random.standard_normal((config.model.blendshapes, len(experiment.garment.vertices), 3)).astype(
         np.float32
@@ -77,7 +77,7 @@ def paper_model() -> Model:
 
 
 def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
-    """The paper's Psi and NCS, both for as many vertices, as a whole and their networks alone.
+    """Measure the paper's Psi and NCS for the same number of vertices, complete and as networks alone.
 
     Args:
         errors: of the same forms on a trained garment, mm; the best form is the fastest that errs little enough.
@@ -93,13 +93,13 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
             path = onnx.to_onnx(model, folder / "psi.onnx", int8=int8)
             kinds[kind] = errors[kind]
             calls[f"psi: {kind}"], size[f"psi: {kind}"] = onnx_call(path, model), path.stat().st_size
-            path = given_features(model, folder / "network.onnx", int8=int8, whole=False)
+            path = given_features(model, folder / "network.onnx", int8=int8, skinned=False)
             calls[f"psi network: {kind}"], size[f"psi network: {kind}"] = session_call(path), path.stat().st_size
-    peer = peers.published(vertices)
+    ncs = baselines.published(vertices)
     for int8 in (False, True):
-        for whole in (True, False):
-            name = f"ncs{'' if whole else ' network'}{': int8' if int8 else ''}"
-            path = peers.write(folder / "ncs.onnx", peer, int8=int8, whole=whole)
+        for skinned in (True, False):
+            name = f"ncs{'' if skinned else ' network'}{': int8' if int8 else ''}"
+            path = baselines.write(folder / "ncs.onnx", ncs, int8=int8, skinned=skinned)
             calls[name], size[name] = session_call(path), path.stat().st_size
     calls |= {f"jax: {name}": jax_call(forms[name]) for name in ("plain", "folded")}
     library = _library(folder)
@@ -121,7 +121,7 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
 
 
 def _shipped(folder: Path, rounds: int, frames: int) -> dict:
-    """Variants of a garment of the library: time, bytes, and distance to jax's unspecialised model in a rollout."""
+    """Measure variants of a garment of the library: time, bytes, and distance in a rollout to the unspecialised one."""
     config = inference.load(SHIPPED).config
     betas = assembly.betas(config)
     model = inference.load(SHIPPED, betas=betas)
@@ -192,7 +192,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
 
 
 def _resting() -> dict:
-    """The time saved on a character that stops, and then is left alone once `resting` says so, and the error."""
+    """Measure the time saved on a character that stops and is skipped once `resting` is true, and the error."""
     model = specialise.specialise(inference.load(SHIPPED))
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
@@ -210,7 +210,7 @@ def _resting() -> dict:
 
 
 def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
-    """Microseconds a character of crowds in jax, every one of its own body."""
+    """Measure microseconds a character in crowds in jax, each character with its own body."""
     models = [specialise.specialise(inference.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
     calls = {}
     for count in crowds:
@@ -226,24 +226,24 @@ def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
 
 
 def interleaved(calls: dict[str, Call], rounds: int) -> dict[str, float]:
-    """Time calls like `timing.interleaved`, in microseconds."""
+    """Return the times of `timing.interleaved` in microseconds."""
     return {name: 1e6 * seconds for name, seconds in timing.interleaved(calls, rounds, WARM).items()}
 
 
 def onnx_call(path: Path, model: Model) -> Call:
-    """One frame of an exported model."""
+    """Return a call of one frame of an exported model."""
     pose = _pose(model)
     tensors = (*onnx.first_state(model, pose), np.asarray(pose.rotations)[None], np.asarray(pose.translation)[None])
     return bound(path, dict(zip(onnx.INPUTS, tensors, strict=True)))
 
 
 def session_call(path: Path) -> Call:
-    """One call of a graph on random inputs."""
-    return bound(path, peers.feed(path))
+    """Return a call of a graph on random inputs."""
+    return bound(path, baselines.feed(path))
 
 
 def bound(path: Path, feed: dict[str, np.ndarray]) -> Call:
-    """A call that reads and writes buffers of its own, as an engine's does."""
+    """Return a call that reads and writes its own buffers, like an engine's."""
     run = session(path)
     binding = run.io_binding()
     for name, value in feed.items():
@@ -256,18 +256,18 @@ def bound(path: Path, feed: dict[str, np.ndarray]) -> Call:
 
 
 def _library(folder: Path) -> Path | None:
-    """`psi.c`, compiled; None on a machine without a C compiler."""
+    """Compile `psi.c`; return its library, None on a machine without a C compiler."""
     return native.build(folder) if native.compiler() else None
 
 
 def c_call(library: Path, path: Path, model: Model, vertices: bool = True) -> Call:
-    """One frame in plain C."""
+    """Return a call of one frame in plain C."""
     pose = _pose(model)
     return native.Psi(library, path, *pose).bound(*pose, vertices)
 
 
 def jax_call(model: Model, vertices: bool = True) -> Call:
-    """One frame in jax, compiled."""
+    """Return a call of one frame in jax, compiled."""
     pose = _pose(model)
     state = inference.initial_state(model, pose)
     compiled = inference.step.lower(model, state, pose, vertices).compile()
@@ -275,7 +275,7 @@ def jax_call(model: Model, vertices: bool = True) -> Call:
 
 
 def packed_call(model: Model) -> Call:
-    """One frame in jax, compiled, that calls plain C."""
+    """Return a call of one frame in jax, compiled, that calls plain C."""
     pose, packed = _pose(model), psi_ffi.pack(model)
     state = inference.initial_state(model, pose)
     compiled = psi_ffi.step.lower(packed, state, pose).compile()
@@ -295,17 +295,17 @@ def _fewer(model: Model) -> dict[str, Model]:
     }
 
 
-def given_features(model: Model, path: Path, *, int8: bool, whole: bool = True) -> Path:
-    """Psi spared what NCS and SNUG are spared in `peers.write`: pose inputs and skinning transforms are given.
+def given_features(model: Model, path: Path, *, int8: bool, skinned: bool = True) -> Path:
+    """Write Psi with the inputs that NCS and SNUG get in `baselines.write`: pose features and skinning transforms.
 
     Args:
-        whole: with blend shapes and skinning; else to the weights of the shapes.
+        skinned: with blend shapes and skinning; else to the weights of the shapes.
     """
     g, network = Graph(int8), model.network
     count, size, vertices = len(network.pose_mean), len(network.first), model.wearer.template.shape[1]
     given, found = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
-    if whole:
+    if skinned:
         given["transforms"], found["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
         moved = g.skinned(onnx.canonical(g, latent, model), "transforms", network.weights)
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")
@@ -317,7 +317,7 @@ def given_features(model: Model, path: Path, *, int8: bool, whole: bool = True) 
 
 
 def floor_us(size: int, rounds: int = 50) -> float:
-    """Microseconds in which this machine's one thread reads so many bytes, again and again."""
+    """Measure the microseconds in which one thread of this machine reads that many bytes, repeatedly."""
     row = np.ones(max(size // 4, 1), np.float32)
     seconds = []
     for _ in range(rounds):
@@ -328,13 +328,13 @@ def floor_us(size: int, rounds: int = 50) -> float:
 
 
 def one_thread() -> None:
-    """This process on one core from now on; before jax has started."""
+    """Restrict this process to one core; call it before jax starts."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def plot(report: dict, path: Path) -> None:
-    """Error against time of the variants, with the front of those that none is better than in both."""
+    """Plot error against time of the variants, with their Pareto front."""
     points = sorted((v["us"], max(v["error_mm"], 1e-4), v["name"], v["runtime"]) for v in report["variants"])
     front = sorted(p for p in points if not any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in points))
     figure, axis = plt.subplots(figsize=(8, 5), constrained_layout=True)

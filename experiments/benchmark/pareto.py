@@ -1,4 +1,4 @@
-"""Error against time of all that can move a garment, what wins, and what is on the front."""
+"""Error against time of every method that moves a garment, with winners and Pareto fronts."""
 
 import tempfile
 from pathlib import Path
@@ -44,11 +44,11 @@ def measure(
     iterations: tuple[int, ...] = ITERATIONS,
     shapes: dict[str, float] = SHAPES,
 ) -> dict:
-    """Points of all runs, and what wins where a garment has runs of NCS beside runs of Psi.
+    """Measure the points of all runs, and find winners for garments with runs of both NCS and Psi.
 
     Args:
         runs: folders of runs and of packed models; those of one garment are compared with each other.
-        frames: of each motion; gaps: of them, at how many the solver is asked.
+        frames: of each motion; gaps: number of these at which the solver is asked.
         motions: default: those on which all runs of a garment are evaluated.
         descent_steps: of Phi; iterations: of the solver, of which the last is until it has converged.
         shapes: names of the forms of Psi and of baselines with fewer blend shapes, and the part of them that they have.
@@ -62,7 +62,7 @@ def measure(
     cases = [prepare(of_it, motions, frames) for of_it in garments.values()]
     points = []
     with progress_bar("garments", len(garments)) as report, tempfile.TemporaryDirectory() as folder:
-        for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items())):
+        for index, (case, (garment, of_it)) in enumerate(zip(cases, garments.items(), strict=True)):
             variants, solved = every(case, of_it, Path(folder), descent_steps, iterations, shapes)
             us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
             for key, each in variants.items():
@@ -77,16 +77,15 @@ def measure(
 
 
 def _short(run: str) -> str:
-    """A run as it is called on every machine: a garment of the library by its name."""
+    """Return the name of a run that holds on every machine: a garment of the library by its name."""
     return Path(run).name if run and trained.packed(run) else run
 
 
 def wins(points: list[dict]) -> dict:
-    """Garments that have both, on which Psi beats NCS: in every error at no more time than NCS takes, and in time at
-    no more of any error.
+    """Find garments on which Psi beats NCS: in every error at no more time, and in time at no greater error.
 
     Both are in ONNX Runtime, and in forms of the same kinds: as trained, with fewer blend shapes, in eight bits. NCS is
-    taken in the fastest whose errors are at most USABLE times those of the form that was trained. Of several runs
+    represented by its fastest form with errors at most USABLE times those of the trained form. Of several runs
     (seeds) the medians of a form are compared.
     """
     won = {"wins_at_equal_time": [], "wins_at_equal_error": [], "compared": []}
@@ -113,7 +112,7 @@ def wins(points: list[dict]) -> dict:
 
 
 def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
-    """Time and errors of each form, by name, over the runs that have it."""
+    """Return median time and errors of each form, by name, over the runs that have it."""
     names = dict.fromkeys(p["name"] for p in points)
     return {
         name: {key: float(np.median([p[key] for p in points if p["name"] == name])) for key in ("us", *ERRORS)}
@@ -122,7 +121,7 @@ def _medians(points: list[dict]) -> dict[str, dict[str, float]]:
 
 
 def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
-    """The `points` that two reports share, and Kendall's tau of their order by time and by each error."""
+    """Return the number of `points` that two reports share, and Kendall's tau of their orders by time and error."""
     named = {(p["garment"], p["run"], p["name"]): p for p in others}
     pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
     found = {"points": len(pairs)}
@@ -133,7 +132,7 @@ def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
 
 
 def _better(one: dict, other: dict, error: str) -> bool:
-    """True for a point that is no worse in time and error, and better in one."""
+    """Return whether a point is no worse in time and error, and better in one."""
     no_worse = one["us"] <= other["us"] and one[error] <= other[error]
     return no_worse and (one["us"], one[error]) != (other["us"], other[error])
 
@@ -160,24 +159,24 @@ def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps
 
 
 def plot(report: dict, path: Path | BinaryIO) -> None:
-    """Each error against time, a row for each garment, with the fronts.
+    """Plot each error against time, a row for each garment, with the fronts.
 
-    What is beyond the plot's ends is drawn at them.
+    Points beyond the plot's ends are drawn at them.
     """
     points = report["points"]
     garments = list(dict.fromkeys(point["garment"] for point in points))
     size = (5 * len(ERRORS), 4.2 * len(garments))
     figure, axes = plt.subplots(len(garments), len(ERRORS), figsize=size, squeeze=False, constrained_layout=True)
-    for row, garment in zip(axes, garments):
+    for row, garment in zip(axes, garments, strict=True):
         of_it = [point for point in points if point["garment"] == garment]
-        for axis, (error, label) in zip(row, ERRORS.items()):
+        for axis, (error, label) in zip(row, ERRORS.items(), strict=True):
             for family, runtime in dict.fromkeys((point["family"], point["runtime"]) for point in of_it):
                 chosen = [point for point in of_it if (point["family"], point["runtime"]) == (family, runtime)]
                 where = [p["us"] for p in chosen], np.clip([p[error] for p in chosen], LEAST[error], MOST[error])
                 style = {"ms": 5, "alpha": 0.8, "color": COLOURS[family], "label": f"{family} ({runtime})"}
                 axis.loglog(*where, MARKERS[runtime], **style)
             front = sorted((p["us"], max(p[error], LEAST[error])) for p in of_it if p["front"][error])
-            axis.step(*zip(*front), color="black", lw=0.8, where="post")
+            axis.step(*zip(*front, strict=True), color="black", lw=0.8, where="post")
             axis.set(xlabel="us a frame", ylabel=label, title=garment)
             axis.spines[["top", "right"]].set_visible(False)
     axes[0, 0].legend(title="Pareto front: line", fontsize=8)

@@ -1,8 +1,8 @@
 """Cloth as engines simulate it: extended position-based dynamics (XPBD, Macklin et al. 2016), Newton's on the CPU.
 
-The garment's edges are springs, as stiff as the membrane they stand for (Van Gelder 1998); hinges bend as ours do; the
-body is a mesh that cloth is pushed out of, with the same friction and distance. Newton adds up the corrections of all
-springs at a vertex (Jacobi), so steps must be short for them to be soft: longer ones are not stable.
+The garment's edges are springs as stiff as the membrane that they replace (Van Gelder 1998). Hinges bend as in the
+reference solver. The body is a mesh that pushes cloth out, with the same friction and distance. Newton adds up the
+corrections of all springs at a vertex (Jacobi), so only short steps are stable.
 """
 
 import time
@@ -27,7 +27,7 @@ class Xpbd:
     """A garment on a character, moved from frame to frame.
 
     Args:
-        substeps: of a frame, each with so many `iterations`.
+        substeps: of a frame, each with `iterations` iterations.
 
     Raises:
         ImportError: if Newton is not installed.
@@ -47,7 +47,9 @@ class Xpbd:
             radius=[config.collision_offset] * len(mass),
         )  # fmt: skip
         edges = topology.edges(faces)
-        for (i, j), stiffness in zip(edges, springs(template, faces, edges, float(material.mu), float(material.lam))):
+        for (i, j), stiffness in zip(
+            edges, springs(template, faces, edges, float(material.mu), float(material.lam)), strict=True
+        ):
             builder.add_spring(int(i), int(j), float(stiffness), 0.0, 0)
         a, b, left, right = np.asarray(scene.mesh.hinges).T
         squared = np.sum((template[a] - template[b]) ** 2, axis=1)
@@ -64,7 +66,7 @@ class Xpbd:
         self.contacts = self.collide.contacts()
 
     def step(self, now: np.ndarray, velocity: np.ndarray, held: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-        """The garment [V, 3] m at the next frame.
+        """Return the garment [V, 3] m at the next frame.
 
         Args:
             velocity: [V, 3] m/s; held: [V, 3] m, where pinned vertices go.
@@ -88,8 +90,9 @@ class Xpbd:
 
 
 def springs(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray, mu: float, lam: float) -> np.ndarray:
-    """Stiffness [E] N/m of edges in the place of a membrane (Van Gelder 1998): Young's modulus times the area of the
-    triangles at an edge, over its length squared.
+    """Return the stiffness [E] N/m of edges that replace a membrane (Van Gelder 1998).
+
+    It is Young's modulus times the area of the triangles at an edge, over its length squared.
 
     Args:
         mu, lam: Lame's constants of the membrane, Pa.
@@ -107,7 +110,7 @@ def springs(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray, mu: floa
 def simulate(
     engine: Xpbd, experiment: Experiment, character: Character, poses: Pose, start: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """An autoregressive rollout [T, V, 3] m relative to the root at every frame, and its median microseconds a frame.
+    """Simulate an autoregressive rollout [T, V, 3] m relative to the root; return it and median microseconds a frame.
 
     Args:
         poses: windows [T, 3, ...]; start: [V, 3] m, relative to the root at the first frame, where it stands still.

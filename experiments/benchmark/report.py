@@ -1,8 +1,8 @@
-"""Measures how fast and how small the parts are, each beside something it is compared with, in one interleaved run.
+"""Measure how fast and how small the parts are, each beside its comparison, in one interleaved run.
 
     python -m experiments.benchmark --json benchmark.json --plot benchmark.png     # all parts, one after the other
-    python -m experiments.benchmark --quick                                        # that it all works
-    python -m experiments.benchmark --compare old.json                             # ratios, and what is beyond noise
+    python -m experiments.benchmark --quick                                        # checks that it all works
+    python -m experiments.benchmark --compare old.json                             # ratios, and flags beyond noise
     python -m experiments.benchmark --part stage1                                  # the paper's Phi, 4 000 vertices
     python -m experiments.benchmark --part inference                               # Psi on one thread, beside NCS
     python -m experiments.benchmark runs/thesis/tshirt/{ours,ncs} --part pareto    # error against time
@@ -18,20 +18,20 @@ on the same garment. The plot is of the cost against the vertices.
 `inference` times one frame on one thread, with weights in the cache: the paper's Psi (random weights, 4 000 vertices),
 NCS's network at its published sizes, and a trained garment of the library in its variants (in plain C too where there
 is a compiler), whose `error_mm` is the mean distance of vertices to jax's unspecialised model over a rollout of 300
-frames. `floor_us` is how long this machine takes to read as many bytes.
+frames. `floor_us` is the time in which this machine reads as many bytes.
 
 `pareto` gives time and error, on one thread, of every way to move a garment: skinning, Psi and Phi in their variants,
 the solver stopped early, and runs of baselines (`configs/ncs.yaml`). It takes folders of runs and names of shipped
-garments, by default all of these; what is compared on a garment must be trained for the same physics, bodies and
-motions. Phi and the solver are loops and take no turns: their times are of whole loops, or medians of their frames.
+garments, by default all of these; runs of one garment must be trained for the same physics, bodies and motions. Phi
+and the solver are loops and take no turns: their times are of complete loops, or medians of their frames.
 Errors are those of `clothjax evaluate`, in rollouts on motions held out of training; `swing_error` is the rms
-error of the velocity of what skinning does not do, over the solver's.
+error of the velocity that skinning does not explain, over the solver's.
 
-`--quick` is not for its figures: a small Phi, few rounds and frames, one garment; and not what mostly compiles, the
-times of compilation, the growth with vertices and the scenes.
+`--quick` only checks that the parts run: a small Phi, few rounds and frames, one garment. It leaves out the slow
+compilations: their times, the growth with vertices and the scenes.
 
-With `--compare OLD.json` the times of both reports are set beside each other, and those flagged whose ratio is beyond
-the noise of both; of `pareto`, also whether both put the points in the same order (Kendall's tau).
+`--compare OLD.json` sets the times of both reports side by side and flags ratios beyond the noise of both. For `pareto`
+it also tells whether both put the points in the same order (Kendall's tau).
 """
 
 import json
@@ -97,7 +97,7 @@ def main(argv: list[str]) -> None:
 
 
 def draw(report: dict, part: str, path: Path) -> None:
-    """The plot of a part; none of a quick one of stage 1, which has no growth to be drawn."""
+    """Draw the plot of a part; a quick stage 1 has no growth to draw."""
     if part == "stage1" and "seconds_by_vertices" not in report[part]:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -105,32 +105,32 @@ def draw(report: dict, part: str, path: Path) -> None:
     print(f"drawn in {path}")
 
 
-def each_part(runs: list[str], quick: bool, kept: Path, plot: Path) -> dict:
-    """Every part, each in a process of its own: they differ in how many cores jax may use.
+def each_part(runs: list[str], quick: bool, report_path: Path, plot: Path) -> dict:
+    """Run every part in its own process, because parts differ in the number of cores that jax may use.
 
     Args:
-        kept: where the report so far is written after each part, should the next one fail.
+        report_path: file of the report so far, written after each part in case the next one fails.
     """
     report = {}
-    kept.parent.mkdir(parents=True, exist_ok=True)
+    report_path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for part in PARTS:
             path = Path(folder) / f"{part}.json"
             command = [sys.executable, "-m", "experiments.benchmark", *(runs if part == "pareto" else [])]
             command += ["--part", part, "--json", str(path), "--plot", str(plot), *(["--quick"] if quick else [])]
             print(f"part {part}", flush=True)
-            if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
+            if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode != 0:
                 raise ValueError(
-                    f"the part {part} failed, as said above: run it alone with --part {part}; what was measured before "
-                    f"it is in {kept}"
+                    f"the part {part} failed, see above: run it alone with --part {part}; the measures of the parts "
+                    f"before it are in {report_path}"
                 )
             report |= json.loads(path.read_text())
-            kept.write_text(json.dumps(report, indent=1) + "\n")
+            report_path.write_text(json.dumps(report, indent=1) + "\n")
     return report
 
 
 def measure(part: str, names: list[str], quick: bool) -> dict:
-    """The report of one part, and of the machine as that part uses it."""
+    """Measure one part, and the machine as that part uses it."""
     if part == "stage1":
         measured = training_step(quick)
     else:
@@ -144,10 +144,10 @@ def measure(part: str, names: list[str], quick: bool) -> dict:
 
 
 def earlier(path: Path) -> dict:
-    """An earlier report.
+    """Load an earlier report.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if the file is not a report.
     """
     try:
         report = json.loads(path.read_text())
@@ -160,7 +160,7 @@ def earlier(path: Path) -> dict:
 
 
 def training_step(quick: bool) -> dict:
-    """The figures of stage 1."""
+    """Measure stage 1."""
     config = configuration.cli(Config, QUICK if quick else PAPER)
     if quick:
         return stage1.measure(config, QUICK_ROUNDS, compiling=False)
@@ -178,7 +178,7 @@ def training_step(quick: bool) -> dict:
 
 
 def machine() -> dict:
-    """The machine that the figures were measured on."""
+    """Describe this machine."""
     return {
         "device": str(jax.devices()[0].device_kind),
         "devices": jax.device_count(),

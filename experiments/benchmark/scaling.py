@@ -1,4 +1,4 @@
-"""How the cost of a training step grows with the vertices of the garment."""
+"""Growth of the cost of a training step with the vertices of the garment."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ SIZES = (500, 1000, 2000, 4000, 8000, 20000)
 
 
 def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
-    """Seconds of a training step on t-shirts of about so many vertices, and the exponent of their growth."""
+    """Measure seconds of a training step on t-shirts of about these sizes in vertices, and the exponent of growth."""
     body, names = storage.load_body(config.body), storage.joint_names(config.body)
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
     programs, clips = {}, None
@@ -40,7 +40,7 @@ def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
 
 
 def plot(report: dict, path: Path) -> None:
-    """Seconds against vertices, with the fit and proportional growth."""
+    """Plot seconds against vertices, with the fit and proportional growth."""
     vertices = np.array([int(n) for n in report["seconds_by_vertices"]])
     seconds = np.array(list(report["seconds_by_vertices"].values()))
     exponent = report["vertex_exponent"]

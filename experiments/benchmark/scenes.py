@@ -1,4 +1,4 @@
-"""The cost of a training step where the scene lacks something: what is absent is not in the compiled program."""
+"""Cost of a training step in scenes that lack something: absent parts are not in the compiled program."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,7 +20,7 @@ POLE = 0.05  # of the width, held by the pole
 
 
 def _configured(**parts: dict) -> Change:
-    """The same experiment with some settings of some parts of its configuration changed."""
+    """Return the same experiment with some settings of its configuration changed."""
 
     def change(experiment: Experiment) -> Experiment:
         changed = {part: dataclasses.replace(getattr(experiment.config, part), **new) for part, new in parts.items()}
@@ -30,7 +30,7 @@ def _configured(**parts: dict) -> Change:
 
 
 def _pinned(held: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """The same experiment with those vertices [V, 3] m held."""
+    """Return the same experiment with those vertices [V, 3] m pinned."""
 
     def change(experiment: Experiment) -> Experiment:
         return experiment._replace(garment=experiment.garment._replace(pinned=held(experiment.garment.vertices)))
@@ -69,13 +69,13 @@ SCENES: dict[str, Change] = {
 
 
 def build(experiment: Experiment, name: str) -> Experiment:
-    """One of `SCENES`, of the same garment."""
+    """Build one of `SCENES`, with the same garment."""
     changed = SCENES[name](experiment)
     return changed._replace(scene=scene.build_scene(changed.garment, changed.body, changed.config))
 
 
 def update(experiment: Experiment):
-    """A training step and the state it starts from."""
+    """Return a training step and the state it starts from."""
     clips = _standing(experiment) if experiment.scene.still else assembly.training_clips(experiment)[0]
     return stage1.make_update(experiment.scene, clips, experiment.config, 1, 1), stage1.init(
         experiment.scene, clips, experiment.config
@@ -83,7 +83,7 @@ def update(experiment: Experiment):
 
 
 def _standing(experiment: Experiment):
-    """Clips of one pose."""
+    """Return clips of one pose."""
     names = assembly.training_motions(experiment.config)
     clip = assembly.motion(experiment._replace(scene=experiment.scene._replace(still=False)), names[0])
     pose = Motion(np.repeat(clip.rotations[:1], 30, 0), np.repeat(clip.translation[:1], 30, 0), clip.fps)
@@ -91,7 +91,7 @@ def _standing(experiment: Experiment):
 
 
 def measure(config: Config, rounds: int) -> dict:
-    """Flops, bytes and seconds of a training step in each scene, compiled without loops, and ratios to the full one."""
+    """Measure flops, bytes and seconds of a training step in each scene, without loops, and ratios to the full one."""
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
     experiment = assembly.assemble(config)
     programs = {}

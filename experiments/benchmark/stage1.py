@@ -1,4 +1,4 @@
-"""The cost of a training step of Phi, part by part."""
+"""Cost of a training step of Phi, part by part."""
 
 import dataclasses
 import tempfile
@@ -33,7 +33,7 @@ BATCH = 4
 
 
 class Moment(NamedTuple):
-    """A training that begins: its state and clips, and the first step of its first simulation."""
+    """The start of a training: its state and clips, and the first step of its first simulation."""
 
     state: stage1.TrainingState
     clips: Clips
@@ -41,10 +41,10 @@ class Moment(NamedTuple):
 
 
 def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
-    """The figures of a training step at a configuration whose body nodes take part in message passing.
+    """Measure a training step of a configuration whose body nodes take part in message passing.
 
     Args:
-        compiling: measures too how long compilation takes.
+        compiling: whether to measure the time of compilation too.
     """
     experiment = assembly.assemble(config)
     moment = first_moment(experiment)
@@ -59,7 +59,7 @@ def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
 
 
 def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
-    """Encoder and processor, forward and backward, against the textbook's."""
+    """Measure encoder and processor, forward and backward, against the textbook's."""
     config, state = experiment.config, moment.state
 
     def loss(form, model):
@@ -72,11 +72,11 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
     params = {name: state.params[name] for name in names}
     forms = {"ours": passed, "textbook": textbook.process}
     arguments = (params, state.statistics, moment.first.seen)
-    kept, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
+    stored, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
     programs = {
         "ours": program(loss(forms["ours"], recomputed), *arguments),
-        "ours, nothing recomputed": program(loss(forms["ours"], kept), *arguments),
-        "textbook": program(loss(forms["textbook"], kept), *arguments),
+        "ours, nothing recomputed": program(loss(forms["ours"], stored), *arguments),
+        "textbook": program(loss(forms["textbook"], stored), *arguments),
     }
     seconds = interleaved(programs, rounds)
     memory = {name: temporary_bytes(one) for name, one in programs.items()}
@@ -102,13 +102,13 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
 
 
 def passed(params: dict, statistics: dict, scene: Scene, seen: Features, model: ModelConfig) -> Array:
-    """Encode and Process: the garment's node latents [V, W] from features."""
+    """Encode and process features; return the garment's node latents [V, W]."""
     one = MessagePassing(model, scene.graph, scene.level, scene.garment.pinned)
     return one.apply({"params": params, "statistics": statistics}, seen)
 
 
 def convolution(experiment: Experiment, rounds: int) -> dict:
-    """The first block of the mesh convolution, forward and backward, against building every kernel."""
+    """Measure the first block of the mesh convolution, forward and backward, against building every kernel."""
     config = experiment.config
     level = config.model.convolution[0]
     count = len(experiment.garment.vertices)
@@ -142,7 +142,7 @@ def convolution(experiment: Experiment, rounds: int) -> dict:
 
 
 def compilation(experiment: Experiment) -> dict:
-    """Seconds until a training step on a rollout is traced and compiled: without, and with, a persistent cache."""
+    """Measure seconds to trace and compile a training step on a rollout, without and with a persistent cache."""
     config = experiment.config
     clips, _ = assembly.training_clips(experiment)
     state = jax.eval_shape(lambda: stage1.init(experiment.scene, clips, config))
@@ -165,7 +165,7 @@ def compilation(experiment: Experiment) -> dict:
 
 
 def step(experiment: Experiment, moment: Moment, rounds: int) -> dict:
-    """The training step and its pieces, beside the peaks of this machine; and a batch against single steps."""
+    """Measure the training step and its pieces against the peaks of this machine, and a batch against single steps."""
     config, scene = experiment.config, experiment.scene
     several = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, batch=BATCH, pool=BATCH))
     states = {"step": moment.state, "batch": stage1.init(scene, moment.clips, several)}
@@ -202,7 +202,7 @@ def step(experiment: Experiment, moment: Moment, rounds: int) -> dict:
 
 
 def _pieces(experiment: Experiment, moment: Moment) -> dict:
-    """Functions, with their arguments, that together are most of a training step."""
+    """Return functions, with their arguments, that together make most of a training step."""
     config, scene = experiment.config, experiment.scene
     params, statistics = moment.state.params, moment.state.statistics
     simulation = jax.tree.map(lambda x: x[0], moment.state.pool)
@@ -244,7 +244,7 @@ def _pieces(experiment: Experiment, moment: Moment) -> dict:
 
 
 def first_moment(experiment: Experiment) -> Moment:
-    """The first moment of a training."""
+    """Return the first moment of a training."""
     clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
     state = stage1.init(experiment.scene, clips, experiment.config)
     simulation = jax.tree.map(lambda x: x[0], state.pool)

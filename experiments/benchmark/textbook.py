@@ -1,7 +1,6 @@
-"""The processor and the mesh convolution written as their papers put them: every message from concatenated rows, every
-kernel built.
+"""The processor and the mesh convolution in the form of their papers: messages from concatenated rows, kernels built.
 
-What the library's own are compared with, in result, time and memory. Both use the library's MLP.
+The library's own are compared with them in result, time and memory. Both use the library's MLP.
 """
 
 import jax
@@ -13,14 +12,16 @@ from clothjax.types import Array
 
 
 def mlp(params: Params, x: Array) -> Array:
-    """The library's MLP of such parameters, with a LayerNorm, on [N, inputs]."""
+    """Apply the library's MLP with a LayerNorm to [N, inputs]."""
     kernels = [layer["kernel"] for name, layer in params.items() if name.startswith("dense")]
     return MLP((x.shape[-1], *(kernel.shape[1] for kernel in kernels))).apply({"params": params}, x)
 
 
 def process(params, statistics, scene, seen, config) -> Array:
-    """Node latents [V, W] of the garment: every message from concatenated rows, gathered, summed by `segment_sum`,
-    block after block, with a body node for every slot and every pair in every block."""
+    """Return node latents [V, W] of the garment.
+
+    Every message comes from concatenated, gathered rows, summed by `segment_sum`, with a body node for every slot and
+    every pair in every block."""
     encoder = params["encoder"]
     pinned = scene.garment.pinned.astype(jnp.int32)
     count = len(pinned)
@@ -44,7 +45,7 @@ def process(params, statistics, scene, seen, config) -> Array:
     graph["world"] = (jnp.concatenate([slot, vertex]), jnp.concatenate([vertex, slot]))
     pairs = jnp.concatenate([seen.world.to_garment, seen.world.to_body])
     edges["world"] = mlp(encoder["world"], normalisation.standardise(statistics["world"], pairs))
-    for stack, stacked in zip(config.processor, params["processor"].values()):
+    for stack, stacked in zip(config.processor, params["processor"].values(), strict=True):
         active = seen.world.active & jnp.asarray(scene.level >= stack.lowest_level)
         keep = jnp.concatenate([active, active])[:, None]
         for index in range(stack.blocks):
@@ -64,7 +65,7 @@ def process(params, statistics, scene, seen, config) -> Array:
 
 
 def convolve(params, x: Array, ids: Array, mask: Array) -> Array:
-    """The mesh convolution [P, O] with the kernel [I, O] of every vertex and neighbour built."""
+    """Apply the mesh convolution [P, O], building the kernel [I, O] of every vertex and neighbour."""
     coefficients = params["coefficients"] * jnp.asarray(mask, x.dtype)[..., None]
     kernels = jnp.einsum("pkm,imo->pkio", coefficients, params["basis"])
     gathered = x[jnp.where(mask, ids, 0)]

@@ -1,4 +1,4 @@
-"""Time, floating-point operations and memory of compiled programs, and what this machine could do at best."""
+"""Time, floating-point operations and memory of compiled programs, and the peaks of this machine."""
 
 import contextlib
 import time
@@ -31,16 +31,17 @@ class Program(NamedTuple):
 
 
 def program(function, *arguments) -> Program:
-    """`function` compiled for these arguments."""
+    """Compile `function` for these arguments."""
     return Program(jax.jit(function).lower(*arguments).compile(), arguments)
 
 
 def interleaved(calls: dict[Hashable, Call], rounds: int, in_a_row: int = 1) -> dict[Hashable, float]:
-    """Median seconds of each call over rounds in which all take turns, in an order that changes: a slow minute is slow
-    for all.
+    """Measure median seconds of each call over rounds in which all take turns, in a changing order.
+
+    So a slow minute is slow for all.
 
     Args:
-        in_a_row: calls at each turn, of which the last is timed.
+        in_a_row: calls at each turn; the last is timed.
     """
     taken, order, names = {name: [] for name in calls}, np.random.default_rng(0), list(calls)
     for call in calls.values():
@@ -59,34 +60,35 @@ def interleaved(calls: dict[Hashable, Call], rounds: int, in_a_row: int = 1) -> 
 
 
 def noise() -> float | None:
-    """By what factor the median time of a call differs from itself: the 95th percentile, over all that `interleaved`
-    has timed in this process, of the ratio between its odd rounds and its even ones; None before it has."""
+    """Return the factor by which the median time of a call differs from itself; None before `interleaved` ran.
+
+    It is the 95th percentile, over all calls timed in this process, of the ratio between odd and even rounds."""
     return float(np.percentile(_differences, 95)) if _differences else None
 
 
 def temporary_bytes(one: Program) -> int:
-    """Memory that a program needs beside its arguments and results."""
+    """Return the memory that a program needs beside its arguments and results."""
     return int(one.compiled.memory_analysis().temp_size_in_bytes)
 
 
 def cost(one: Program) -> dict[str, float]:
-    """The compiler's count of floating-point operations and bytes accessed; the inside of a loop counts once."""
+    """Return the compiler's count of floating-point operations and bytes accessed; the inside of a loop counts once."""
     counted = one.compiled.cost_analysis() or {}
     return {"flops": float(counted.get("flops", 0.0)), "bytes": float(counted.get("bytes accessed", 0.0))}
 
 
 @contextlib.contextmanager
 def unrolled() -> Iterator[None]:
-    """Within it, scans are compiled without loops, so that `cost` counts all of them.
+    """Compile scans within it without loops, so that `cost` counts all their steps.
 
-    Loops that end when their work is done, as those of the searches for contact, still count once.
+    Loops without a fixed end, such as the searches for contact, still count once.
     """
     with mock.patch.object(jax.lax, "scan", partial(jax.lax.scan, unroll=True)):
         yield
 
 
 def peaks(rounds: int) -> dict[str, float]:
-    """The peaks of this machine: flop/s in a product of float32 matrices, byte/s in adding to a long vector."""
+    """Measure the peaks of this machine: flop/s in a product of float32 matrices, byte/s in adding to a long vector."""
 
     def stream(long):  # in place: fresh memory would be slower
         return jax.lax.fori_loop(0, PASSES, lambda _, a: a + 1.0, long)
@@ -100,7 +102,7 @@ def peaks(rounds: int) -> dict[str, float]:
 
 
 def against_peaks(seconds: float, counted: dict[str, float], best: dict[str, float]) -> dict[str, float]:
-    """A program's cost with the fractions of both peaks that it reaches."""
+    """Return a program's cost with the fractions of both peaks that it reaches."""
     return {
         "seconds": seconds,
         **counted,

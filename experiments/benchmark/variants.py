@@ -1,4 +1,4 @@
-"""Rollouts by each thing that moves a garment: Psi and Phi in their variants, baselines, the solver, XPBD, skinning."""
+"""Rollouts by every method that moves a garment: variants of Psi and Phi, baselines, the solver, XPBD, skinning."""
 
 import dataclasses
 import tempfile
@@ -18,14 +18,15 @@ from clothjax.evaluation.rollouts import load_run, skinned_trajectory, windows
 from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.files import storage
-from clothjax.networks import baselines, psi
+from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
+from clothjax.networks.baselines import inputs as baseline_inputs
 from clothjax.runtime import inference, specialise, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Motion, Pose
-from experiments.benchmark import peers, position_based
+from experiments.benchmark import baselines, position_based
 from experiments.benchmark.inference import bound, c_call, given_features, onnx_call, session_call
 from experiments.benchmark.position_based import Xpbd
 from experiments.benchmark.timing import Call
@@ -38,7 +39,7 @@ ALIKE = ("body", "fps", "physics", "material", "motions")  # of the configuratio
 
 
 class Variant(NamedTuple):
-    """Something that moves a garment."""
+    """A method that moves a garment, with its rollouts."""
 
     family: str  # such as psi, ncs or solver
     runtime: str  # onnx, c, jax or warp
@@ -49,7 +50,7 @@ class Variant(NamedTuple):
 
 
 class Case(NamedTuple):
-    """The common ground of the variants of a garment."""
+    """The experiment, character and motions that the variants of a garment share."""
 
     experiment: Experiment
     character: Character
@@ -57,11 +58,11 @@ class Case(NamedTuple):
 
 
 def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
-    """The common ground of runs of a garment: the character and the motions of the first one's evaluation."""
+    """Prepare the case of a garment's runs: the character and the motions of the first run's evaluation."""
     configs = [trained.network(run)[0] for run in runs]
     first = configs[0]
     wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
-    for run, config, wearer in zip(runs, configs, wearers):
+    for run, config, wearer in zip(runs, configs, wearers, strict=True):
         differing = [name for name in ALIKE if getattr(config, name) != getattr(first, name)]
         differing += ["betas"] * (wearer != wearers[0])
         if differing:
@@ -88,12 +89,12 @@ def every(
     iterations: tuple[int, ...],
     shapes: dict[str, float],
 ) -> tuple[dict[tuple[str, str], Variant], list[np.ndarray]]:
-    """The variants of one garment by run and name, and the solver's own loops."""
+    """Return the variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
         network = trained.network(run)[0].peer.network
         if network in ("ncs", "snug"):
-            found = _peer(case, run, folder, shapes)
+            found = _baseline(case, run, folder, shapes)
         else:
             found = _psi(case, run, network or "psi", folder, shapes)
             found |= {} if network else _phi(case, run, descent_steps)
@@ -112,14 +113,14 @@ def _skinning(case: Case, folder: Path) -> Variant:
     g("Transpose", g.skinned(garment, "transforms", weights), perm=[0, 2, 1], name="vertices")
     g.save(path, {"transforms": (1, len(weights), 12)}, {"vertices": (1, weights.shape[1], 3)})
     tracks = [skinned_trajectory(experiment, case.character, windows(clip)) for clip in case.clips]
-    return Variant("skinning", "onnx", tracks, bound(path, peers.feed(path)))
+    return Variant("skinning", "onnx", tracks, bound(path, baselines.feed(path)))
 
 
 def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
-    """Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
+    """Return Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
 
-    In ONNX Runtime it is timed as baselines are, with pose inputs and skinning transforms given; and, as in C, from the
-    pose, which no baseline does.
+    In ONNX Runtime it is timed twice: with pose inputs and skinning transforms given, like a baseline, and from the
+    pose, like in C.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
     model = inference.load(run, betas=np.asarray(case.character.betas))
@@ -146,14 +147,14 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
 
 
 def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
-    """Return a trajectory like `rollouts.psi_trajectory`, by a function from a motion to vertices [T, V, 3] m."""
+    """Return trajectories like `psi_trajectory`, from a function that gives vertices [T, V, 3] m of a motion."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
     local = part._replace(translation=(part.translation - part.translation[:1]).astype(np.float32))
     return run(local) - local.translation[:, None]
 
 
 def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Variant]:
-    """Phi with more and fewer steps of its descent, in jax."""
+    """Return Phi with more and fewer steps of its descent, in jax."""
     config, model = trained.phi(run)
     case = case._replace(experiment=assembly.assemble(config))  # with the graph that it was trained on
     if config.model.latent_update != "descent":
@@ -165,7 +166,7 @@ def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Var
 
 
 def _loop(case: Case, config: Config, model: dict) -> Variant:
-    """Phi's rollout in jax, timed as a whole."""
+    """Return Phi's rollout in jax, timed in one piece."""
     experiment, tracks, us = case.experiment._replace(config=config), [], []
     run = jax.jit(lambda m, c, p: rollouts.states(phi_animator, m, experiment, c, p))
     for clip in case.clips:
@@ -177,22 +178,24 @@ def _loop(case: Case, config: Config, model: dict) -> Variant:
     return Variant("phi", "jax", tracks, None, float(np.median(us)))
 
 
-def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
-    """NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
+def _baseline(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
+    """Return NCS or SNUG's network in ONNX Runtime, with all shapes and with fewer."""
     folder = Path(tempfile.mkdtemp(dir=folder))
     experiment, character = case.experiment, case.character
     config, model = trained.network(run)
     network = config.peer.network
-    kept = psi.input_joints(experiment.names, config.stage2)
+    input_joints = psi.input_joints(experiment.names, config.stage2)
     weights, moving = _moving(experiment)
     free = ~np.asarray(experiment.scene.garment.pinned)
-    peer = peers.made(network, model["params"], np.asarray(character.template), weights, free)
+    baseline = baselines.assemble(network, model["params"], np.asarray(character.template), weights, free)
     constants = psi.constant_inputs(character.betas, character.material, config.material)
 
     @jax.jit
     def inputs(poses: Pose):
         def one(window):
-            seen = baselines.inputs(window, character.joints, constants, experiment.scene.body.parents, kept, config)
+            seen = baseline_inputs(
+                window, character.joints, constants, experiment.scene.body.parents, input_joints, config
+            )
             moved = skinning.joint_transforms(window.rotations[2], character.joints, experiment.scene.body.parents)
             rows = {name: x if name == "dynamic" else x[None] for name, x in seen.items()}
             return rows | {"transforms": moved[moving].reshape(1, -1, 12)}
@@ -203,30 +206,32 @@ def _peer(case: Case, run: Path, folder: Path, shapes: dict[str, float]) -> dict
         seen = {name: np.asarray(x) for name, x in inputs(windows(clip)).items()}
         return [{name: x[t] for name, x in seen.items()} for t in range(len(clip.translation) - 2)]
 
-    coding = peers.write(folder / "codes.onnx", peer, whole=False)
+    coding = baselines.write(folder / "codes.onnx", baseline, skinned=False)
     try:
         usual = [assembly.motion(experiment, name) for name in specialise.CALIBRATION_CLIPS]
     except ValueError:  # for another body
         usual = case.clips
-    codes = np.concatenate([peers.run(coding, frames(clip)) for clip in usual])
-    forms = {network: peer}
+    codes = np.concatenate([baselines.run(coding, frames(clip)) for clip in usual])
+    forms = {network: baseline}
     forms |= {
-        f"{network}, {name} of the shapes": peers.fewer(peer, codes, max(1, int(part * codes.shape[1])))
+        f"{network}, {name} of the shapes": baselines.fewer(baseline, codes, max(1, int(part * codes.shape[1])))
         for name, part in shapes.items()
     }
     variants, seen = {}, [frames(clip) for clip in case.clips]
     first = [skinned_trajectory(experiment, character, jax.tree.map(lambda x: x[:1], windows(c))) for c in case.clips]
     for name, form in forms.items():
         for int8 in (False, True):
-            path = peers.write(folder / f"{len(variants)}.onnx", form, int8=int8)
-            tracks = [np.concatenate([start, peers.run(path, of)[:-1]]) for start, of in zip(first, seen)]
+            path = baselines.write(folder / f"{len(variants)}.onnx", form, int8=int8)
+            tracks = [
+                np.concatenate([start, baselines.run(path, of)[:-1]]) for start, of in zip(first, seen, strict=True)
+            ]
             label = f"{name}, int8" if int8 else name
-            variants[label] = Variant(network, "onnx", tracks, bound(path, peers.feed(path)))
+            variants[label] = Variant(network, "onnx", tracks, bound(path, baselines.feed(path)))
     return variants
 
 
 def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], list[np.ndarray]]:
-    """The reference solver, stopped after some iterations; and its loops when it is not."""
+    """Return the reference solver stopped after some iterations, and its complete loops."""
     experiment, variants, solved = case.experiment, {}, []
     for iterations in limits:
         tracks, us, converged = [], [], []
@@ -251,7 +256,7 @@ def _solver(case: Case, limits: tuple[int, ...]) -> tuple[dict[str, Variant], li
 
 
 def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
-    """XPBD, from where the solver starts; nothing where Newton is not installed."""
+    """Return XPBD from the solver's start; nothing if Newton is not installed."""
     variants, experiment = {}, case.experiment
     for substeps, iterations in XPBD:
         try:
@@ -263,14 +268,14 @@ def _position_based(case: Case, starts: list[np.ndarray]) -> dict[str, Variant]:
             position_based.simulate(engine, experiment, case.character, windows(clip), start)
             for clip, start in zip(case.clips, starts, strict=True)
         ]
-        tracks, us = zip(*loops)
+        tracks, us = zip(*loops, strict=True)
         name = f"xpbd, {substeps} substeps of {iterations} iteration{'s' * (iterations > 1)}"
         variants[name] = Variant("xpbd", "warp", list(tracks), None, float(np.median(us)))
     return variants
 
 
 def _moving(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
-    """Skinning weights [J', V] of the joints that move the garment, and their indices."""
+    """Return skinning weights [J', V] of the joints that move the garment, and their indices."""
     weights = np.asarray(experiment.scene.garment.weights, np.float32)
     moving = np.flatnonzero(weights.max(axis=0) > 0)
     return weights[:, moving].T, moving

@@ -32,7 +32,7 @@ class Scene(NamedTuple):
 
 
 def scene(name: str, count: int = COUNT) -> Scene:
-    """A scene of `SCENES` with `count` x `count` vertices."""
+    """Build a scene of `SCENES` with `count` x `count` vertices."""
     x, z = (a.reshape(-1) for a in np.meshgrid(*[np.linspace(-SIZE / 2, SIZE / 2, count)] * 2, indexing="ij"))
     flat = np.stack([x, np.zeros_like(x), z], axis=1)
     i, j = np.divmod(np.arange((count - 1) ** 2), count - 1)
@@ -62,7 +62,7 @@ class Reference:
         self.converged = True
 
     def time_step(self) -> TimeStep:
-        """The next step, without friction; the contact plane of a vertex touches the sphere nearest to it."""
+        """Return the next step, without friction; the contact plane of a vertex touches the sphere nearest to it."""
         contact = None
         if self.scene.centre is not None:
             normal = self.position - self.scene.centre
@@ -81,7 +81,7 @@ class Reference:
         )
 
     def advance(self) -> None:
-        """One step."""
+        """Advance one step."""
         fall = np.array([0.0, -energies.GRAVITY * self.timestep**2, 0.0])
         start = np.where(self.scene.pinned[:, None], self.position, self.position + self.velocity + fall)
         new, info = solver.solve_step(
@@ -133,11 +133,11 @@ class Vbd:
 
     @property
     def position(self) -> np.ndarray:
-        """Vertices [V, 3] m."""
+        """Return the vertices [V, 3] m."""
         return self.now.particle_q.numpy().astype(np.float64)
 
     def advance(self) -> None:
-        """One step."""
+        """Advance one step."""
         self.now.clear_forces()
         if self.collide:
             self.collide.collide(self.now, self.contacts)
@@ -146,7 +146,7 @@ class Vbd:
 
 
 def neo_hookean(corners: Array, inverse: Array, area: Array, mu: Array, lam: Array, thickness=energies.THICKNESS):
-    """Newton's membrane energy [F] J of triangles [F, 3, 3] m: stable neo-Hookean (Smith et al. 2018), 0 at rest."""
+    """Return Newton's membrane energy [F] J of triangles [F, 3, 3] m: neo-Hookean (Smith et al. 2018), 0 at rest."""
     edges = jnp.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=-1)
     gradient = jnp.einsum("fab,fbc->fac", edges, inverse)
     stretch = jnp.linalg.norm(jnp.cross(gradient[..., 0], gradient[..., 1]), axis=-1)  # of the area
@@ -156,13 +156,16 @@ def neo_hookean(corners: Array, inverse: Array, area: Array, mu: Array, lam: Arr
 
 
 def contact_stiffness(count: int) -> float:
-    """N/m of Newton's contact: under the weight of one of `count` vertices as deep as our cubic, k d = 3 k' d^2."""
+    """Return the stiffness N/m of Newton's contact.
+
+    Under the weight of one of `count` vertices it is as deep as our cubic: k d = 3 k' d^2.
+    """
     weight = energies.GRAVITY * MATERIAL.density * SIZE**2 / count
     return float(np.sqrt(3.0 * CONFIG.collision_stiffness * weight))
 
 
 def quadratic(distance: Array, offset: float) -> Array:
-    """Newton's contact energy of signed distances [V] m, over our stiffness as in `elements`: [V] m^3."""
+    """Return Newton's contact energy of signed distances [V] m, over our stiffness as in `elements`: [V] m^3."""
     depth = jnp.maximum(offset - distance, 0.0)
     return 0.5 * contact_stiffness(len(distance)) / CONFIG.collision_stiffness * depth * depth
 
@@ -171,13 +174,13 @@ NEWTONS_LAWS = Laws(neo_hookean, quadratic)  # of its membrane and its contact
 
 
 def at_rest(scene: Scene) -> Rest:
-    """Rest measures of the sheet, in float64."""
+    """Return rest measures of the sheet, in float64."""
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, energies.rest_measures(scene.flat, scene.mesh))
 
 
 def masses(scene: Scene) -> np.ndarray:
-    """[V] kg, in float64."""
+    """Return the masses [V] kg of the vertices, in float64."""
     with jax.enable_x64(True):
         return np.asarray(energies.vertex_areas(scene.flat, scene.mesh.faces)) * MATERIAL.density
 

@@ -1,8 +1,8 @@
-"""Our reference solver beside NVIDIA Newton's cloth solver (VBD, on the CPU): one cloth, one material, the same steps.
+"""Compare our reference solver with NVIDIA Newton's (VBD, on the CPU): one cloth, one material, the same steps.
 
     python -m experiments.compare_solvers --png runs/solvers.png       # needs: pip install clothjax[compare,render]
     python -m experiments.compare_solvers --scenes edge --substeps 1 2 4 8 --json runs/solvers.json
-    python -m experiments.compare_solvers --scenes hang sphere --iterations 4000   # so many that Newton has converged
+    python -m experiments.compare_solvers --scenes hang sphere --iterations 4000   # enough for Newton to converge
 
 A square sheet hangs from one edge until it is at rest (`hang`), falls from level held by one edge (`edge`) or by two
 corners (`corners`), or drops without friction on a sphere (`sphere`). Both are implicit Euler, whose damping depends
@@ -10,8 +10,8 @@ on the time step, so both take the same one. Distances are between vertices, in 
 
     material    ours to Newton's, each with its own energies: the membrane is Saint Venant-Kirchhoff's here, there a
                 neo-Hookean one that agrees with it to second order of the strain only
-    solver      ours with Newton's membrane and contact to Newton's: what the solvers make different
-    chance      the same to itself after a disturbance of a micrometre: what no solver can repeat
+    solver      ours with Newton's membrane and contact to Newton's: the difference of the solvers
+    chance      the same to itself after a disturbance of a micrometre: no solver can repeat more
 
 Contact is cubic here and quadratic there, as deep under the weight of a vertex. Not the same in any of the three: the
 length of an edge in our bending energy is the present one, Newton's that at rest; and Newton has float32 and a fixed
@@ -20,6 +20,7 @@ number of iterations (`--iterations` a frame, shared by its substeps), so that a
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -50,8 +51,10 @@ DISTURBANCE = 1e-6  # m
 AT_REST = 2  # substeps of `hang`: few, for their damping
 
 
-def simulate(engines: dict, frames: int, substeps: int, report=lambda _frame: None) -> tuple[dict, dict]:
-    """Positions [T, V, 3] m of every engine, which take turns frame by frame, and median seconds of a frame."""
+def simulate(
+    engines: dict, frames: int, substeps: int, report: Callable[[int], None] = lambda _: None
+) -> tuple[dict, dict]:
+    """Return positions [T, V, 3] m of every engine, in turns frame by frame, and median seconds of a frame."""
     tracks, seconds = {name: [] for name in engines}, {name: [] for name in engines}
     for frame in range(frames):
         for name, engine in engines.items():
@@ -66,7 +69,7 @@ def simulate(engines: dict, frames: int, substeps: int, report=lambda _frame: No
 
 
 def distances(one: np.ndarray, other: np.ndarray) -> dict[str, float]:
-    """Vertex distances in mm of two trajectories [T, V, 3] m: mean and max over time and of the last frame."""
+    """Return vertex distances in mm of two trajectories [T, V, 3] m: mean and max over time and of the last frame."""
     apart = 1e3 * np.linalg.norm(one - other, axis=-1)
     return {
         "mean_mm": float(apart.mean()),
@@ -77,7 +80,7 @@ def distances(one: np.ndarray, other: np.ndarray) -> dict[str, float]:
 
 
 def energies(scene: Scene, position: np.ndarray) -> dict[str, float]:
-    """Our terms in mJ of a sheet at [V, 3] m; gravity is relative to its start."""
+    """Return our terms in mJ of a sheet at [V, 3] m; gravity is relative to its start."""
     engine = Reference(scene, 1.0)
     engine.position = position
     step = engine.time_step()._replace(position=scene.start)
@@ -87,7 +90,7 @@ def energies(scene: Scene, position: np.ndarray) -> dict[str, float]:
 
 
 def pins(scene: Scene, position: np.ndarray) -> float:
-    """The downward pull of membrane and bending at [V, 3] m on the pins, over the weight of the free vertices."""
+    """Return the downward pull of membrane and bending at [V, 3] m on the pins, over the weight of free vertices."""
     step = Reference(scene, 1.0).time_step()
 
     def elastic(x):
@@ -102,7 +105,7 @@ def pins(scene: Scene, position: np.ndarray) -> float:
 def compare(
     names: list[str], substeps: list[int], frames: int, iterations: int, count: int = COUNT
 ) -> tuple[dict, dict]:
-    """Measures of every scene at every number of substeps a frame, and the positions [T, V, 3] m they are of."""
+    """Measure every scene at every number of substeps a frame; return the measures and the positions [T, V, 3] m."""
     scenes = {name: scene(name, count) for name in names}
     jobs = [(name, n) for name in names for n in (substeps if name != "hang" else [AT_REST])]
     tracks, measured, done = {}, {}, 0
@@ -137,7 +140,7 @@ def compare(
 
 
 def table(report: dict) -> str:
-    """The report for a reader, as Markdown."""
+    """Return the report as Markdown."""
     kinds = ("material", "solver", "chance")
     rows = ["| distance mean (max), mm | " + " | ".join(f"{kind} | at the end" for kind in kinds) + " |"]
     rows.append("|---" * 7 + "|")
@@ -160,7 +163,7 @@ def table(report: dict) -> str:
 
 
 def draw(out: Path, tracks: dict) -> None:
-    """Both at the same moments, in the shortest steps of every scene."""
+    """Draw both at the same moments, in the shortest steps of every scene."""
     ball = trimesh.creation.icosphere(4, SPHERE)
     rows = {}
     frames = len(next(iter(tracks.values()))["ours"])

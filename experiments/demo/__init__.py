@@ -1,1 +1,1 @@
-"""A character that is steered in the browser, and the garment on it."""
+"""A character steered in the browser, and the garment on it."""

@@ -1,4 +1,4 @@
-"""A character that is steered, and its garment by Psi and what that is compared with, frame by frame."""
+"""A steered character, frame by frame: its garment by Psi, and by the stages that Psi is compared with."""
 
 import time
 from collections import deque
@@ -34,8 +34,8 @@ class Outfit:
 
     Args:
         run: the folder of a run or of a packed model.
-        count: characters that wear it.
-        fine: on the mesh of 4 000 vertices, if there is one.
+        count: number of characters.
+        fine: whether to use the mesh of 4 000 vertices, if there is one.
     """
 
     def __init__(self, run: Path, betas: np.ndarray, material: Material | None, count: int = 1, fine: bool = False):
@@ -58,24 +58,24 @@ class Outfit:
         return self._comparison.dress(self._betas, self._material)
 
     def mesh(self, stage: str) -> tuple[np.ndarray, np.ndarray]:
-        """The faces [F, 3] of what a stage shows, and its vertices [V, 3] m at rest."""
+        """Return the faces [F, 3] and the vertices [V, 3] m at rest of the mesh that a stage shows."""
         if stage == "psi":
             return np.asarray(self.model.faces), np.asarray(self.model.wearer.template).T
         return self._comparison.faces, np.asarray(self._character.template)
 
     def psi(self, poses: list[Pose]) -> np.ndarray:
-        """Vertices [N, V, 3] m of the next frame of the characters, whose poses these are."""
-        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses)))
+        """Return vertices [N, V, 3] m of the next frame, for the characters' poses."""
+        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
         if self._states is None:
             self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(given)
         self._states, vertices = inference.step_crowd(self._crowd, self._states, given)
         return np.asarray(vertices)
 
     def beside(self, stages: list[str], window: Pose) -> dict[str, np.ndarray]:
-        """Vertices [V, 3] m of the next frame of the first character, by other stages.
+        """Return vertices [V, 3] m of the next frame of the first character, by other stages.
 
         Args:
-            stages: one that was left out for a frame begins anew, on the skinned garment.
+            stages: a stage that was left out for a frame restarts from the skinned garment.
             window: its last three poses.
         """
         self._beside = {
@@ -85,7 +85,7 @@ class Outfit:
 
 
 def finer(config: Config) -> str | None:
-    """The garment of a configuration on 4 000 vertices, if that is there."""
+    """Return the garment of a configuration on 4 000 vertices, None if there is none."""
     name = config.garment.replace("_1000", "_4000")
     return name if name != config.garment and storage.asset(name).is_file() else None
 
@@ -96,7 +96,7 @@ def _comparison(run: Path) -> "Comparison":
 
 
 class Comparison:
-    """The comparison of Psi, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
+    """The stages beside Psi, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
 
     def __init__(self, run: Path):
         self.config, model = trained.phi(run)
@@ -118,16 +118,16 @@ class Comparison:
         self._problem = reference.problem(self.scene, config)
 
     def dress(self, betas: np.ndarray, material: Material | None) -> characters.Character:
-        """A character; the material defaults to the configured one."""
+        """Dress a character; the material defaults to the configured one."""
         material = configured_material(self.config) if material is None else material
         material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
         return characters.dress(self.scene, jnp.asarray(betas, jnp.float32), material, self.config.physics)
 
     def step(self, stage: str, character, before: tuple | None, window: Pose) -> tuple:
-        """The state a stage goes on from in the frame after the next, and the next vertices [V, 3] m, in the world.
+        """Return a stage's next state, and its next vertices [V, 3] m in the world.
 
         Args:
-            before: what it goes on from; None to begin.
+            before: the stage's state; None to begin.
             window: the last three poses.
         """
         here = window.translation[1]
@@ -166,15 +166,15 @@ class Steering:
         self.doing, self.until = family, until
 
     def velocity(self) -> np.ndarray:
-        """[2] m/s."""
+        """Return the velocity [2] m/s that the player asks for."""
         return SPEEDS[self.gait] * np.array([np.sin(self.heading), np.cos(self.heading)])
 
 
 class Show:
-    """A player's character and its garment, frame by frame, whatever shows them.
+    """A player's character and its garment, frame by frame, independent of the display.
 
     Raises:
-        ValueError: if the clips and the garment are not of as many frames a second.
+        ValueError: if the frame rates of the clips and the garment differ.
     """
 
     def __init__(self, clips: Library, wander: tuple[str, ...], run: Path):
@@ -193,23 +193,23 @@ class Show:
         count: int = 1,
         fine: bool = False,
     ) -> None:
-        """Another garment, body or number of characters; `betas` may be some of those that the body has."""
+        """Change the garment, body or number of characters; `betas` may be the first few of the body's."""
         config = trained.psi(run).config
         if config.fps != self.player.clips.fps:
             raise ValueError(f"the clips are at {self.player.clips.fps} frames a second, {run} at {config.fps}")
         self._pose_body, body = _body(config.body)
-        whole = np.zeros(body.shapedirs.shape[-1])
+        all_betas = np.zeros(body.shapedirs.shape[-1])
         if betas is not None:
-            whole[: len(betas)] = betas[: len(whole)]
-        self.outfit = Outfit(run, whole, material, count, fine)
+            all_betas[: len(betas)] = betas[: len(all_betas)]
+        self.outfit = Outfit(run, all_betas, material, count, fine)
         self._shape = [
-            shaped(body, jnp.asarray(whole)) for shaped in (skinning.shaped_vertices, skinning.shaped_joints)
+            shaped(body, jnp.asarray(all_betas)) for shaped in (skinning.shaped_vertices, skinning.shaped_joints)
         ]
         self.body_faces = np.asarray(body.faces)
         self.past = deque(self.past, maxlen=max(3, BEHIND * (count - 1) + 1))
 
     def frame(self) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
-        """The next: vertices [N, V, 3] m by stage, in their places, and those [B, 3] of bodies."""
+        """Return the next frame: vertices [N, V, 3] m by stage, in their places, and vertices [B, 3] m of bodies."""
         began = time.perf_counter()
         steering = self.steering
         family = steering.doing if self.frames < steering.until else None
@@ -218,12 +218,15 @@ class Show:
         self.frames += 1
         poses = [self.past[max(len(self.past) - 1 - BEHIND * i, 0)] for i in range(self.outfit.count)]
         shift = np.stack([_place(i, each, pose) for i, each in enumerate(poses)])
-        bodies = [np.asarray(self._pose_body(*self._shape, each)) + by for each, by in zip(poses[:BODIES], shift)]
+        bodies = [
+            np.asarray(self._pose_body(*self._shape, each)) + by
+            for each, by in zip(poses[:BODIES], shift, strict=False)
+        ]
         paused = time.perf_counter()
         shown = {"psi": self.outfit.psi(poses) + shift[:, None]}
         self.seconds = {"psi": time.perf_counter() - paused, "pose": paused - began}
         newest = [self.past[max(len(self.past) - 3 + i, 0)] for i in range(3)]
-        window = Pose(*(np.stack(each) for each in zip(*newest)))
+        window = Pose(*(np.stack(each) for each in zip(*newest, strict=True)))
         others = [stage for stage in self.stages if stage != "psi"]
         for i, (stage, vertices) in enumerate(self.outfit.beside(others, window).items()):
             aside = np.array([APART * (i + 1), 0.0, 0.0], np.float32)
@@ -234,23 +237,23 @@ class Show:
 
 @cache
 def _body(name: str):
-    """A body, and a function that poses one of such vertices and joints."""
+    """Load a body, and a function that poses it with given vertices and joints."""
     body = storage.load_body(name)
     return jax.jit(lambda vertices, joints, pose: skinning.pose_body(body, vertices, joints, pose)), body
 
 
 def _place(number: int, pose: Pose, first: Pose) -> np.ndarray:
-    """The offset [3] m of a character of a crowd: it stands in its row behind the first."""
+    """Return the offset [3] m of a character of a crowd: its place in a row behind the first."""
     row = int(np.sqrt(number))
     there = np.array([APART * (number - row * row - row), 0.0, -APART * row])
     return (there + (first.translation - pose.translation) * [1, 0, 1]).astype(np.float32)
 
 
 def strain(vertices: np.ndarray, rest: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The largest |l / l_0 - 1| of the edges at each vertex [V].
+    """Return the largest |l / l_0 - 1| of the edges at each vertex [V].
 
     Args:
-        rest: [V, 3] m, where they have their lengths l_0.
+        rest: [V, 3] m, the mesh whose edges have the lengths l_0.
     """
     edges = topology.edges(faces)
     length, original = (np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (vertices, rest))

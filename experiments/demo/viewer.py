@@ -1,12 +1,12 @@
-"""A character that you steer, dressed by Psi, live in the browser.
+"""Steer a character, dressed by Psi, live in the browser.
 
     python -m experiments.demo                                      # or: make demo
     python -m experiments.demo dress --port 8080
     python -m experiments.demo runs/my_skirt --motions clips/*.motion.h5
 
 Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the
-arrows are the viewer's own, for its camera. The panel has the same as the keys, the garment, body and cloth, and what
-stands beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
+arrows are the viewer's own, for its camera. The panel repeats the keys and chooses garment, body and cloth, and the
+stages beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
 """
 
 import argparse
@@ -42,7 +42,7 @@ COLOURS = {
 class Viewer:
     """A `Show` in a browser (viser), with its panel.
 
-    The panel's callbacks run in other threads: they only leave word, and `run` acts on it.
+    The panel's callbacks run in other threads: they only set flags, and `run` acts on them.
 
     Args:
         server: viser's.
@@ -86,8 +86,8 @@ class Viewer:
             self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
             self.body = gui.add_checkbox("Body", True)
             self.wireframe = gui.add_checkbox("Wireframe", False)
-            told = f"strain: red from {STRAINED:.0%}; penetration: red from {1e3 * DEEP:.0f} mm inside the body"
-            self.points = gui.add_dropdown("Points", ("none", "strain", "penetration"), hint=told)
+            hint = f"strain: red from {STRAINED:.0%}; penetration: red from {1e3 * DEEP:.0f} mm inside the body"
+            self.points = gui.add_dropdown("Points", ("none", "strain", "penetration"), hint=hint)
             self.follow = gui.add_checkbox("Follow", True)
             self.pause = gui.add_checkbox("Pause", False)
             self._button("Single step", lambda: setattr(self, "_one_more", True))
@@ -104,7 +104,7 @@ class Viewer:
             self.server.gui.add_command(label, hotkey=hotkey).on_trigger(lambda _: act())
 
     def run(self, frames: int | None = None) -> None:
-        """Shows frame after frame, at the clips' rate where it can, until so many are done."""
+        """Show frame after frame, at the clips' rate if possible, until the given number is reached."""
         done, due, shown_at = 0, time.perf_counter(), deque(maxlen=60)
         while frames is None or done < frames:
             if self._dress_anew:
@@ -136,24 +136,27 @@ class Viewer:
             time.sleep(max(0.0, due - time.perf_counter()))
 
     def _dress(self) -> None:
-        """Dresses as the panel says; a paused show goes on by a frame, or nothing of it would be seen."""
+        """Dress by the panel's settings; a paused show advances one frame, so that the change is seen."""
         self._dress_anew, self._draw_anew, self._one_more = False, True, True
         betas = np.array([slider.value for slider in self.betas])
         material = Material(*(unscaled(self.material[name].value, self.ranges[name]) for name in Material._fields))
         run = self.garments[self.garment.value]
         self.show.dress(run, betas, material, int(self.count.value), self.fine.value)
 
+    def _remove_meshes(self) -> None:
+        self._draw_anew = False
+        for mesh in self.meshes.values():
+            mesh.remove()
+        self.meshes.clear()
+
     def _draw(self) -> None:
         if self._draw_anew:  # other faces, or another look
-            self._draw_anew = False
-            for mesh in self.meshes.values():
-                mesh.remove()
-            self.meshes.clear()
+            self._remove_meshes()
         if self._shown is None:
             return
         garments, bodies = self._shown
         others = [stage for stage in garments if stage != "psi"]
-        worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :]))
+        worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :], strict=True))
         here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
         here = here + [0.65 * APART * len(others), 0, 0]  # all in what the panel leaves free
         drawn = set()
@@ -189,7 +192,7 @@ class Viewer:
         return name
 
     def _label(self, stage: str, body: np.ndarray) -> str:
-        """The name of a stage, over its head."""
+        """Draw the name of a stage over its head."""
         name, place = f"/{stage}/name", (body[:, 0].mean(), body[:, 1].max() + 0.1, body[:, 2].mean())
         if name in self.meshes:
             self.meshes[name].position = place
@@ -229,7 +232,7 @@ def main(argv: list[str]) -> None:
 
 
 def start(arguments: argparse.Namespace) -> Viewer:
-    """A viewer that waits to be run; the browser fetches its page meanwhile.
+    """Start a viewer that waits to be run; the browser fetches its page meanwhile.
 
     Raises:
         ImportError: if viser is not installed.
@@ -256,7 +259,7 @@ def start(arguments: argparse.Namespace) -> Viewer:
 
 
 def clips(paths: list[Path] | None, names: tuple[str, ...]) -> dict[str, Motion]:
-    """Clips by their names; the embedded ones for None.
+    """Load clips by their names; the embedded ones for None.
 
     Raises:
         ValueError: if two files have one name.

@@ -1,4 +1,4 @@
-"""A trained run in autoregressive rollouts: long, beyond what it was trained on, and after shocks."""
+"""A trained run in autoregressive rollouts: long, beyond its training, and after shocks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -40,7 +40,7 @@ class Loop(NamedTuple):
 
 
 class Shock(NamedTuple):
-    """A shock at frame `BEFORE` of a loop, and what came after."""
+    """A shock at frame `BEFORE` of a rollout, and its consequences."""
 
     loop: Loop
     recovery: int | None  # frames until the energy is within `WITHIN` of the undisturbed one, and stays there
@@ -48,7 +48,7 @@ class Shock(NamedTuple):
 
 
 def play(model: Model, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices [T, V, 3] m relative to the root, codes [T, L] in standard deviations, `ok` [T]."""
+    """Return vertices [T, V, 3] m relative to the root, codes [T, L] in standard deviations, and `ok` [T]."""
     vertices, latents, ok = _play(model, jax.tree.map(jnp.asarray, Pose(*map(np.float32, motion[:2]))))
     root = np.nan_to_num(np.asarray(motion.translation, np.float32))
     return np.asarray(vertices) - root[:, None], np.asarray(latents), np.asarray(ok)
@@ -65,7 +65,7 @@ def _play(model: Model, poses: Pose):
 
 
 def measure(experiment: Experiment, character: Character, played: tuple) -> Loop:
-    """The figures of a rollout."""
+    """Measure a rollout."""
     vertices, latents, ok = played
     finite = np.isfinite(vertices).all(axis=(1, 2)) & np.isfinite(latents).all(axis=1)
     strain = (
@@ -78,7 +78,7 @@ def measure(experiment: Experiment, character: Character, played: tuple) -> Loop
 
 
 def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> dict:
-    """Every rollout of a run; `frames` for the longest. With `quick`, fewer variants."""
+    """Run every rollout of a run; `frames` for the longest. With `quick`, fewer variants."""
     experiment, phi = load_run(run)
     config = experiment.config
     betas, cloth = assembly.betas(config), configured_material(config)
@@ -142,13 +142,13 @@ def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> di
 
 
 def freeze(motion: Motion, start: int, frames: int) -> Motion:
-    """The motion up to a frame, then that frame for `frames` more."""
+    """Return the motion up to a frame, then that frame for `frames` more."""
     order = np.minimum(np.arange(start + frames), start - 1)
     return Motion(motion.rotations[order], motion.translation[order], motion.fps)
 
 
 def disturbed(motion: Motion) -> dict[str, Motion]:
-    """The motion with one shock each at frame `BEFORE`: a jump for good, a frame of NaN, a half-turn of one frame."""
+    """Return the motion with one shock each at frame `BEFORE`: a lasting jump, a frame of NaN, a half-turn."""
     jump = np.where(np.arange(len(motion.translation))[:, None] >= BEFORE, np.float32(TELEPORT), np.float32(0.0))
     broken, turned = np.array(motion.rotations, np.float32), np.array(motion.rotations, np.float32)
     broken[BEFORE] = np.nan
@@ -161,7 +161,7 @@ def disturbed(motion: Motion) -> dict[str, Motion]:
 
 
 def at_rate(motion: Motion, fps: float) -> Motion:
-    """The motion at another frame rate: rotations and places interpolated."""
+    """Resample the motion to another frame rate by interpolation."""
     count = len(motion.translation)
     old = np.arange(count) / motion.fps
     new = np.arange(0, old[-1], 1 / fps)
@@ -176,19 +176,19 @@ def at_rate(motion: Motion, fps: float) -> Motion:
 
 
 def drift_mm(track: np.ndarray) -> np.ndarray:
-    """Return the distance [T] in mm of the farthest vertex of [T, V, 3] m from its place in the first frame."""
+    """Return the largest distance [T] mm of a vertex of [T, V, 3] m from its place in the first frame."""
     return 1e3 * np.linalg.norm(track - track[:1], axis=-1).max(axis=1)
 
 
 def energies(experiment: Experiment, character: Character, track: np.ndarray, motion: Motion) -> np.ndarray:
-    """`energies_of` a track with a frame for every frame of the motion."""
+    """Return `energies_of` a track with a frame for every frame of the motion."""
     return energies_of(experiment, character, track[1:-1], windows(motion))
 
 
 def energies_of(experiment: Experiment, character: Character, track: np.ndarray, poses: Pose) -> np.ndarray:
-    """The energy stored in the cloth and in its motion at the steps of a track [T, V, 3] m, in J: [T - 2].
+    """Return the energy [T - 2] J stored in the cloth and in its motion at the steps of a track [T, V, 3] m.
 
-    All terms but gravity, whose zero is anywhere.
+    All terms except gravity, which has no natural zero.
     """
     state = reference.problem(experiment.scene, experiment.config)
 
@@ -208,7 +208,7 @@ def energies_of(experiment: Experiment, character: Character, track: np.ndarray,
 
 
 def recovery_frames(relative: np.ndarray) -> int | None:
-    """Frames after the shock until `energies_of` over undisturbed ones [T] stay within `WITHIN`; or None."""
+    """Return frames after the shock until energies [T] over undisturbed ones stay within `WITHIN`, or None."""
     first = BEFORE - 3  # the step whose end is the shock
     away = ~(np.abs(relative[first:] - 1.0) <= WITHIN)
     if away[-1]:

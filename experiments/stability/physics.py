@@ -22,7 +22,7 @@ FRAME = 40  # of the walk on which precision is measured
 
 
 def points(random: np.random.Generator, count: int, corners: int) -> np.ndarray:
-    """Elements [count, corners, 3] m of 0.1 um to 10 m: any shape, corners that coincide, lines, planes, far away."""
+    """Return elements [count, corners, 3] m of 0.1 um to 10 m: random, degenerate (points, lines, planes), far away."""
     size = 10.0 ** random.uniform(-7, 1, (count, 1, 1))
     shape = random.normal(size=(count, corners, 3))
     kind = random.integers(0, 8, count)
@@ -39,7 +39,7 @@ def points(random: np.random.Generator, count: int, corners: int) -> np.ndarray:
 
 
 def terms(random: np.random.Generator, count: int) -> dict[str, tuple[Callable, np.ndarray, tuple]]:
-    """For each term its energy of one element, `count` elements to take it at, and the rest of its arguments."""
+    """Return for each term its energy of one element, `count` elements, and the other arguments."""
 
     def unit(vectors):
         return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
@@ -92,7 +92,7 @@ def terms(random: np.random.Generator, count: int) -> dict[str, tuple[Callable, 
 
 
 def contacts(random: np.random.Generator, count: int) -> tuple[Callable, np.ndarray, tuple]:
-    """The distance to a body with faces of no area, at places on its corners, edges and faces, inside and outside."""
+    """Return the distance to a body with degenerate faces, and points on its corners, edges, faces, in- and outside."""
     corner = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (-0.1, 0.1)])
     body = np.concatenate([corner, corner[:1], [[0.1, 0.2, 0.1]]])  # two vertices twice
     faces = np.array(
@@ -113,7 +113,7 @@ def contacts(random: np.random.Generator, count: int) -> tuple[Callable, np.ndar
 
 
 def count_nonfinite(count: int, seed: int = 0) -> dict[str, dict[str, int]]:
-    """Count, of each term, the configurations whose energy, gradient or Hessian product is not finite.
+    """Count the configurations of each term with an energy, gradient or Hessian product that is not finite.
 
     All are in float32; the Hessian is applied to a random direction.
     """
@@ -140,11 +140,13 @@ def count_nonfinite(count: int, seed: int = 0) -> dict[str, dict[str, int]]:
 
 def _counts(values: tuple, count: int) -> dict[str, int]:
     wrong = [~np.isfinite(np.asarray(x, np.float64).reshape(count, -1)).all(axis=1) for x in values]
-    return {"configurations": count} | dict(zip(("energy", "gradient", "hessian"), (int(w.sum()) for w in wrong)))
+    return {"configurations": count} | dict(
+        zip(("energy", "gradient", "hessian"), (int(w.sum()) for w in wrong), strict=True)
+    )
 
 
 def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
-    """Relative errors of float32 against float64 in the energy and the gradient of every term on a garment.
+    """Measure relative errors of float32 against float64 in the energy and the gradient of every term on a garment.
 
     Both get the same numbers, rounded to float32: a step of a walk, its garment shaken by a millimetre.
 
@@ -157,11 +159,11 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
     character = characters.dress(
         scene, jnp.asarray(assembly.betas(config)), material.configured_material(config), config.physics
     )
-    clips = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
+    windows = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
 
     @jax.jit
     def state(key):
-        window = characters.window(scene, character, motion_clips.poses(clips, jnp.int32(FRAME)))
+        window = characters.window(scene, character, motion_clips.poses(windows, jnp.int32(FRAME)))
         cloth = time_step.start(character, window, 0)
         shaken = 1e-3 * jax.random.normal(key, (2, *cloth.position.shape))
         cloth = cloth._replace(position=cloth.position + shaken[0])
@@ -200,5 +202,5 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
 
 
 def with_self_contact(config: Config) -> Config:
-    """The same experiment with every term that there is."""
+    """Return the same experiment with every term."""
     return replace(config, physics=replace(config.physics, edge_contact=True, self_contact=True, self_offset=0.02))

@@ -1,4 +1,4 @@
-"""Stress-tests the energies, the reference solver and a trained run.
+"""Stress-test the energies, the reference solver and a trained run.
 
     python -m experiments.stability --json stability.json                   # the energies and the solver
     python -m experiments.stability runs/quickstart --json stability.json   # and rollouts of the run
@@ -8,13 +8,13 @@
                 gradient or a Hessian product that is not finite. And float32 against float64 on a 4 000-vertex garment.
 2. solver       timesteps from 1/240 to 1/3 s, materials at the sixteen corners of the training ranges, a garment
                 squeezed to 1 % of its height, a body 20 cm from where it was. A case is `recovered`, `reported` (the
-                last frame's `SolverInfo.ok` is false) or `silent`: it says ok of what is broken.
+                last frame's `SolverInfo.ok` is false) or `silent`: broken, but reported as ok.
 3. rollouts     Psi over thousands of frames, on bodies, cloths and frame rates beyond its training, with its pose
                 frozen, and after shocks: a jump of 10 m, a frame of NaN, a half-turn of one frame. Recovery is counted
                 in frames until the energy is within 10 % of the undisturbed loop's and stays there; drift is the way of
                 the farthest vertex over 2 000 frames of one pose. Phi's figures stand beside Psi's.
 
-What brings a state back is described in `clothjax/runtime/inference.py`.
+`clothjax/runtime/inference.py` describes how a state recovers.
 """
 
 import json
@@ -50,7 +50,7 @@ def main(argv: list[str]) -> None:
 
 
 def stress(run: Path | None, quick: bool = False) -> tuple[dict, dict]:
-    """The three layers: the content of the JSON file, and the curves of the third for the picture."""
+    """Run the three layers; return the content of the JSON file, and the curves of the third for the picture."""
     report = {"physics": _physics(1000 if quick else 10000), "float32": _precision(quick)}
     frames = 3 if quick else 10
     with progress_bar("solver", 7 if quick else 24) as done:
@@ -112,7 +112,7 @@ def _precision(quick: bool) -> dict:
 
 
 def readable(report: dict) -> str:
-    """The report for a reader, as Markdown."""
+    """Return the report as Markdown."""
     places = list(report["float32"]["terms"])
     rows = [
         "| energy | configurations | not finite | " + " | ".join(f"float32 at {place}" for place in places) + " |",
@@ -154,7 +154,7 @@ def readable(report: dict) -> str:
 
 
 def plot(report: dict, curves: dict, path: Path) -> None:
-    """A picture of the layers: errors of float32, the solver's cases, the rollouts."""
+    """Plot the layers: errors of float32, the solver's cases, the rollouts."""
     figure, axes = plt.subplots(2, 2, figsize=(13, 9), constrained_layout=True)
     first, second, third, fourth = axes.reshape(-1)
     places = report["float32"]["terms"]

@@ -1,4 +1,4 @@
-"""The reference solver where it is hard: time steps, materials, broken starts, a body that is suddenly elsewhere."""
+"""The reference solver in hard cases: time steps, materials, broken starts, a body that jumps."""
 
 import itertools
 import time
@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
 
 
 def corners(config: Config) -> list[Material]:
-    """The sixteen materials at the ends of the training ranges."""
+    """Return the sixteen materials at the ends of the training ranges."""
     cloth = config.material
     ranges = (cloth.density_range, cloth.mu_range, cloth.lam_range, cloth.bending_range)
     return [
@@ -49,7 +49,7 @@ def corners(config: Config) -> list[Material]:
 
 
 def stress(config: Config, frames: int, quick: bool, progress: Callable[[int], None]) -> dict[str, Outcome]:
-    """Every case, `frames` frames each; with `quick`, one of a kind."""
+    """Run every case for `frames` frames; with `quick`, one of a kind."""
     experiment = assembly.assemble(config)
     betas, cloth = assembly.betas(config), configured_material(config)
     poses = windows(assembly.motion(experiment, config.evaluation.motions[0]))
@@ -103,12 +103,12 @@ def _run(experiment: Experiment, config: Config, character: Character, poses: Po
 
 
 def _next(poses: Pose) -> Pose:
-    """The window whose middle is the frame after the last."""
+    """Return the window whose middle is the frame after the last."""
     return Pose(poses.rotations[-1:][:, [1, 2, 2]], poses.translation[-1:][:, [1, 2, 2]])
 
 
 def seconds_per_frame(config: Config, frames: int) -> dict[str, float]:
-    """Median seconds a frame of a walk takes, body contact included, the share of frames that converged."""
+    """Measure median seconds a frame of a walk with body contact, and the share of frames that converged."""
     experiment = assembly.assemble(config)
     character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
     poses = windows(assembly.motion(experiment, config.evaluation.motions[0]))

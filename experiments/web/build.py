@@ -1,4 +1,4 @@
-"""Builds a page that plays garments in the browser alone: no Python, and nothing but a file server, behind it.
+"""Build a page that plays garments in the browser alone, with only a file server and no Python behind it.
 
     python -m experiments.web.build --out site
     python -m experiments.web.build skirt runs/mine --motions walk_3 dance_3 --out site
@@ -69,25 +69,29 @@ def main(argv: list[str]) -> None:
     print(f"written to {arguments.out}: python -m http.server --directory {arguments.out}")
 
 
-def body(whole: Body, path: Path) -> dict:
-    """Writes the mean body for GPU skinning, and tells where in the file its arrays are."""
-    weights = np.asarray(whole.weights)
+def body(rigged_body: Body, path: Path) -> dict:
+    """Write the mean body for GPU skinning; return the places of its arrays in the file."""
+    weights = np.asarray(rigged_body.weights)
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :INFLUENCES]
-    kept = np.take_along_axis(weights, bones, axis=1)
+    largest = np.take_along_axis(weights, bones, axis=1)
     arrays = {
-        "vertices": np.asarray(whole.vertices, "<f4"),
-        "weights": (kept / kept.sum(axis=1, keepdims=True)).astype("<f4"),
-        "faces": np.asarray(whole.faces, "<u4"),
+        "vertices": np.asarray(rigged_body.vertices, "<f4"),
+        "weights": (largest / largest.sum(axis=1, keepdims=True)).astype("<f4"),
+        "faces": np.asarray(rigged_body.faces, "<u4"),
         "bones": bones.astype("<u2"),
     }
     path.write_bytes(b"".join(array.tobytes() for array in arrays.values()))
     ends = np.cumsum([0, *(array.nbytes for array in arrays.values())])
-    places = {name: [int(at), array.size] for (name, array), at in zip(arrays.items(), ends)}
-    return {"body": places, "joints": np.asarray(whole.joints).tolist(), "parents": [int(p) for p in whole.parents]}
+    places = {name: [int(at), array.size] for (name, array), at in zip(arrays.items(), ends, strict=False)}
+    return {
+        "body": places,
+        "joints": np.asarray(rigged_body.joints).tolist(),
+        "parents": [int(p) for p in rigged_body.parents],
+    }
 
 
 def bundle(out: Path) -> None:
-    """The page's program with its libraries, by esbuild."""
+    """Bundle the page's program with its libraries, by esbuild."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder) / "web"
         work.mkdir()
@@ -105,7 +109,9 @@ def bundle(out: Path) -> None:
 
 
 def _run(command: list[str], folder: Path) -> None:
-    done = subprocess.run([shutil.which(command[0]), *command[1:]], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [shutil.which(command[0]), *command[1:]], cwd=folder, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise ValueError(f"{' '.join(command)} failed: {(done.stderr or done.stdout).strip()}")
 

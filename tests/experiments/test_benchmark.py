@@ -15,9 +15,9 @@ from clothjax.config import Config
 from clothjax.export import native
 from clothjax.files import configuration
 from experiments.benchmark import (
+    baselines,
     comparison,
     inference,
-    peers,
     scaling,
     scenes,
     stage1,
@@ -90,19 +90,19 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
 def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):
     import onnx
 
-    path = peers.write(tmp_path / "ncs.onnx", peers.published(4424))
+    path = baselines.write(tmp_path / "ncs.onnx", baselines.published(4424))
     weights = [x for x in onnx.load(path).graph.initializer if x.data_type == onnx.TensorProto.FLOAT]
     counted = sum(int(np.prod(x.dims)) for x in weights if len(x.dims) in (1, 2))
     # its network, blend shapes with the garment at rest, skinning weights of 15 joints; and a 1
     assert counted - 3_051_776 - 3 * 4424 * 513 - 15 * 4424 <= 1
-    given = peers.feed(path)
-    run = peers.session(path)
+    given = baselines.feed(path)
+    run = baselines.session(path)
     still = {name: 0 * x if name in ("dynamic", "hidden") else x for name, x in given.items()}
     hidden, vertices = run.run(["next_hidden", "vertices"], still)
     assert (hidden == 0).all() and vertices.shape == (1, 4424, 3) and np.isfinite(vertices).all()
     moved, others = run.run(["next_hidden", "vertices"], given)
     assert 0 < np.abs(moved).max() and np.abs(others - vertices).max() > 1e-3
-    small = peers.write(tmp_path / "network.onnx", peers.published(4424), int8=True, whole=False)
+    small = baselines.write(tmp_path / "network.onnx", baselines.published(4424), int8=True, skinned=False)
     assert small.stat().st_size < 3.3e6
 
 

@@ -144,7 +144,7 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     report.write_text(json.dumps({"command": "train", "seed": 3, "hours": 2.0, "psi": {}}))
     arguments = [str(tmp_path / "packed"), "--out", str(tmp_path / "out"), *settings]
     tune.main(arguments)
-    made = trained.made(tmp_path / "out")
+    made = trained.provenance(tmp_path / "out")
     assert made.pop("hours") > 2.0
     assert made == {"command": f"train && python -m experiments.tune {' '.join(arguments)}", "seed": 3}
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))

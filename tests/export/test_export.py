@@ -43,7 +43,7 @@ def test_onnx_of_a_folded_code_and_of_a_relu(motion, tmp_path):
 def test_onnx_of_a_model_that_sees_the_root_alone(motion, tmp_path):
     others = ("joint", "leg", "foot", "back", "spine", "shoulder", "arm", "neck", "head")
     model = random_model(True, others)
-    assert [model.names[i] for i in model.kept] == ["Hips"]
+    assert [model.names[i] for i in model.input_joints] == ["Hips"]
     path = onnx.to_onnx(model, tmp_path / "g.onnx")
     assert apart(onnx.run_onnx(path, model, motion), model, motion).max() < 2e-5
 

@@ -226,5 +226,5 @@ def test_the_teacher_starts_from_zero_and_its_inputs_are_what_an_engine_has(trai
     model, _motion, teacher, _ = trained
     assert (teacher.latents[:, 0] == 0).all()
     assert teacher.latents.shape[1] == teacher.poses.shape[1] + 1
-    kept = len(model.kept)
+    kept = len(model.input_joints)
     assert teacher.poses.shape[-1] == 6 + 3 * 6 * kept + 3 * 3 * (kept - 1)

@@ -37,7 +37,7 @@ def apart(one, other, motion):
 
 def test_a_wide_code_is_folded_away_and_nothing_changes(wide, motion):
     folded = specialise.specialise(wide)
-    assert folded.network.code.kernel is None and folded.network.read.kernel is None
+    assert folded.network.folded and isinstance(folded.network.read, inference.FoldedLayer)
     assert len(folded.network.first) == 32 + 24
     plain = np.asarray(inference.animate(wide, motion)[0])
     assert np.std(plain[500:600], axis=0).max() > 1e-2
@@ -166,13 +166,13 @@ def test_fewer_shapes_bear_eight_bits():
         assert jnp.linalg.norm(apart, axis=-1).mean() < 5e-4, count
 
 
-def test_an_evened_model_is_the_same(wide, motion):
+def test_an_equalised_model_is_the_same(wide, motion):
     clip = motion._replace(rotations=motion.rotations[:100], translation=motion.translation[:100])
     beside = random_model(skip=True)
     folded = [specialise.specialise(each) for each in (wide, beside)]
-    assert all(each.network.code.kernel is None for each in folded)
+    assert all(each.network.folded for each in folded)
     for model in (cj.load("skirt"), specialise.specialise(cj.load("skirt"), blendshapes=50), wide, beside, *folded):
-        even = specialise.smoothed(model)
+        even = specialise.equalised(model)
         one, other = (inference.animate(each, clip)[0] for each in (model, even))
         np.testing.assert_allclose(one, other, atol=3e-5)
         reach = np.abs(specialise.ordinary_weights(even)).max(axis=0)

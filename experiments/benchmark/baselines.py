@@ -1,6 +1,6 @@
 """NCS and SNUG's network (`clothjax/networks/baselines.py`) at inference: one frame as ONNX.
 
-They are spared what Psi does itself: features, and skinning transforms of the joints, come as inputs.
+Unlike Psi they get features, and skinning transforms of the joints, as inputs.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ from clothjax.runtime.inference import Layer
 JOINTS = 15  # that NCS reads, as published
 
 
-class Peer(NamedTuple):
+class Baseline(NamedTuple):
     """A network in its garment, on a character."""
 
     network: str  # ncs or snug
@@ -32,39 +32,39 @@ class Peer(NamedTuple):
     free: np.ndarray  # [V] false where pinned
 
 
-def published(vertices: int) -> Peer:
-    """NCS at its published sizes, with random weights: it is timed, not looked at."""
+def published(vertices: int) -> Baseline:
+    """Build NCS at its published sizes, with random weights, to be timed."""
     config = Config(peer=PeerConfig("ncs"), stage1=Stage1Config(start_timestep=0.0))
     params = jax.jit(lambda k: baselines.init(k, JOINTS, 0, jnp.zeros((1, vertices, 3)), config))(jax.random.key(0))
     random = np.random.default_rng(0)
     weights = random.dirichlet(np.ones(JOINTS), vertices).T
-    return made("ncs", params, random.standard_normal((vertices, 3)), weights, np.ones(vertices, bool))
+    return assemble("ncs", params, random.standard_normal((vertices, 3)), weights, np.ones(vertices, bool))
 
 
-def made(network: str, params: Params, template: np.ndarray, weights: np.ndarray, free: np.ndarray) -> Peer:
-    """A network with all its shapes; arguments as in `Peer`."""
+def assemble(network: str, params: Params, template: np.ndarray, weights: np.ndarray, free: np.ndarray) -> Baseline:
+    """Build a network with all its shapes; the arguments are fields of `Baseline`."""
     params = jax.tree.map(np.asarray, params)
     if network == "ncs":
         shapes = Layer(params["blendshapes"], np.zeros(params["blendshapes"].shape[1], np.float32))
     else:
         shapes = Layer(**params["output"])
-    return Peer(network, params, shapes, None, template, weights, free)
+    return Baseline(network, params, shapes, None, template, weights, free)
 
 
-def fewer(peer: Peer, codes: np.ndarray, count: int) -> Peer:
-    """Keep so many shapes, the principal ones for codes [n, K] that occur, as `specialise` does for Psi."""
-    mix, rows, moved = specialise.principal_rows(codes, peer.shapes.kernel, count)
-    return peer._replace(mix=mix, shapes=Layer(rows, peer.shapes.bias + moved))
+def fewer(baseline: Baseline, codes: np.ndarray, count: int) -> Baseline:
+    """Reduce a network to `count` shapes, the principal ones for codes [n, K], in the way of `specialise`."""
+    mix, rows, moved = specialise.principal_rows(codes, baseline.shapes.kernel, count)
+    return baseline._replace(mix=mix, shapes=Layer(rows, baseline.shapes.bias + moved))
 
 
-def write(path: Path, peer: Peer, *, int8: bool = False, whole: bool = True) -> Path:
-    """Writes the graph; not `whole`: the network, without shapes and skinning.
+def write(path: Path, baseline: Baseline, *, int8: bool = False, skinned: bool = True) -> Path:
+    """Write the graph; if not `skinned`, the network without shapes and skinning.
 
-    Its inputs are `hidden` [1, M], and of NCS `static` [1, S] and `dynamic` [J, 12], of SNUG `inputs` [1, N]; whole,
+    Its inputs are `hidden` [1, M], for NCS `static` [1, S] and `dynamic` [J, 12], for SNUG `inputs` [1, N]; skinned,
     also `transforms` [1, J, 12]. Its outputs are `next_hidden`, and `vertices` [1, V, 3] or `code`.
     """
-    g, params = Graph(int8), peer.params
-    if peer.network == "ncs":
+    g, params = Graph(int8), baseline.params
+    if baseline.network == "ncs":
         units = [params["unit"]]
         locals_, joints = params["local"], params["dynamic"]["0"]["kernel"].shape[0] // baselines.LOCAL
         given = {"static": (1, len(params["static"]["0"]["kernel"])), "dynamic": (joints, len(locals_["0"]["kernel"]))}
@@ -74,32 +74,32 @@ def write(path: Path, peer: Peer, *, int8: bool = False, whole: bool = True) -> 
     width = len(units[0]["state"]["kernel"])
     given["hidden"] = (1, len(units) * width)
     found = {"next_hidden": given["hidden"]}
-    code = _ncs(g, params, joints) if peer.network == "ncs" else _snug(g, units)
-    if whole:
-        given["transforms"] = (1, len(peer.weights), 12)
-        found["vertices"] = (1, len(peer.template), 3)
-        code = g.layer(code, peer.mix) if peer.mix else code
-        garment = g.layer(code, _by_coordinate(peer))
-        moved = g.skinned(garment, "transforms", peer.weights.astype(np.float32))
+    code = _ncs(g, params, joints) if baseline.network == "ncs" else _snug(g, units)
+    if skinned:
+        given["transforms"] = (1, len(baseline.weights), 12)
+        found["vertices"] = (1, len(baseline.template), 3)
+        code = g.layer(code, baseline.mix) if baseline.mix else code
+        garment = g.layer(code, _by_coordinate(baseline))
+        moved = g.skinned(garment, "transforms", baseline.weights.astype(np.float32))
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")
     else:
-        found["code"] = (1, len(peer.shapes.kernel))
+        found["code"] = (1, len(baseline.shapes.kernel))
         g("Identity", code, name="code")
     g.save(path, given, found)
     return path
 
 
 def feed(path: Path) -> dict[str, np.ndarray]:
-    """Random inputs of a graph."""
+    """Return random inputs of a graph."""
     random = np.random.default_rng(1)
     return {value.name: random.standard_normal(value.shape).astype(np.float32) for value in session(path).get_inputs()}
 
 
 def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Vertices [T, V, 3] m of an autoregressive rollout; of a graph that is not whole, codes [T, K].
+    """Return vertices [T, V, 3] m of an autoregressive rollout; codes [T, K] of a graph that is not skinned.
 
     Args:
-        inputs: of each frame, but for `hidden`; what the graph does not read is left out.
+        inputs: of each frame, except `hidden`; entries that the graph does not read are ignored.
     """
     one, found = session(path), []
     read, last = {value.name for value in one.get_inputs()}, one.get_outputs()[-1].name
@@ -111,15 +111,15 @@ def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
     return np.stack(found)
 
 
-def _by_coordinate(peer: Peer) -> Layer:
-    """The layer that gives displacements [3 V], as one that gives the garment, all x first."""
+def _by_coordinate(baseline: Baseline) -> Layer:
+    """Turn a layer that gives displacements [3 V] into one that gives the garment, all x first."""
 
     def ordered(rows):
-        rows = rows.reshape(*rows.shape[:-1], -1, 3) * peer.free[:, None]
+        rows = rows.reshape(*rows.shape[:-1], -1, 3) * baseline.free[:, None]
         return np.swapaxes(rows, -1, -2).reshape(*rows.shape[:-2], -1)
 
-    bias = ordered(peer.shapes.bias) + peer.template.T.reshape(-1)
-    return Layer(ordered(peer.shapes.kernel).astype(np.float32), bias.astype(np.float32))
+    bias = ordered(baseline.shapes.bias) + baseline.template.T.reshape(-1)
+    return Layer(ordered(baseline.shapes.kernel).astype(np.float32), bias.astype(np.float32))
 
 
 def _ncs(g: Graph, params: Params, joints: int) -> str:
@@ -148,7 +148,7 @@ def _snug(g: Graph, units: list[Params]) -> str:
 
 
 def _gru(g: Graph, params: Params, x: str, state: str, name: str | None = None) -> str:
-    """A gated recurrent unit, as `peers` has it."""
+    """Add a gated recurrent unit, the same as in `clothjax.networks.baselines`."""
     width = len(params["state"]["kernel"])
 
     def gates(layer: Params, x: str) -> list[str]:
