@@ -73,9 +73,7 @@ def coefficients(words: list[tuple[str, ...]], phenotype: dict[str, float]) -> n
     share = {AGE: 1.0} | {race: phenotype[race] for race in RACES}
     for name, ladder in LADDERS.items():
         steps = np.linspace(0, 1, len(ladder))
-        share |= {
-            word: np.interp(phenotype[name], steps, row) for word, row in zip(ladder, np.eye(len(ladder)), strict=True)
-        }
+        share |= {word: np.interp(phenotype[name], steps, row) for word, row in zip(ladder, np.eye(len(ladder)))}
     return np.array([np.prod([share[word] for word in target]) for target in words])
 
 
@@ -88,7 +86,7 @@ def sample(words: list[tuple[str, ...]], count: int, seed: int = 0) -> np.ndarra
         mixture = rng.dirichlet([1, 1, 1])
         for name in ("muscle", "weight", "height", "proportions", "cupsize", "firmness"):
             phenotype[name] = rng.beta(1.5, 1.5)
-        rows.append(coefficients(words, phenotype | dict(zip(RACES, mixture, strict=True))))
+        rows.append(coefficients(words, phenotype | dict(zip(RACES, mixture))))
     return np.array(rows)
 
 

@@ -81,34 +81,26 @@ def read_asf(path: str | Path) -> Skeleton:
         elif section == ":units" and key == "angle":
             degrees = words[-1].lower().startswith("deg")
         elif section == ":root" and key == "order":
-            order = _root_order(path, line, words)
-        elif section == ":bonedata" and key == "end":
-            name, bone = _bone(path, line, entry, degrees)
-            bones[name] = bone
+            order = tuple(word.lower() for word in words[1:])
+            if sorted(order) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
+                raise ValueError(f"{path}, line {line}: root order {' '.join(words[1:])}, expected TX to RZ")
         elif section == ":bonedata":
-            entry = {} if key == "begin" else entry | {key: (line, words[1:])}
+            if key == "begin":
+                entry = {}
+            elif key == "end":
+                name, bone = _bone(path, line, entry, degrees)
+                bones[name] = bone
+            else:
+                entry[key] = (line, words[1:])
         elif section == ":hierarchy" and key not in ("begin", "end"):
-            _attach(path, line, words, bones, parents)
+            for child in words[1:]:
+                if child not in bones or (key != "root" and key not in parents):
+                    raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone defined before")
+                parents[child] = words[0]
     if not bones or set(parents) != set(bones):
         orphans = sorted(set(bones) - set(parents))
         raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {orphans}); cut short?")
     return Skeleton(bones, parents, degrees, order)
-
-
-def _root_order(path: str | Path, line: int, words: list[str]) -> tuple[str, ...]:
-    order = tuple(word.lower() for word in words[1:])
-    if sorted(order) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
-        raise ValueError(f"{path}, line {line}: root order {' '.join(words[1:])}, expected TX to RZ")
-    return order
-
-
-def _attach(path: str | Path, line: int, words: list[str], bones: dict[str, Bone], parents: dict[str, str]) -> None:
-    """Enter the children that a line of the hierarchy names into `parents`."""
-    key = words[0].lower()
-    for child in words[1:]:
-        if child not in bones or (key != "root" and key not in parents):
-            raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone known by here")
-        parents[child] = words[0]
 
 
 def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Capture:

@@ -82,11 +82,13 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
     for line, words in lines:
         key = words[0]
         if key == "MOTION":
-            _check_complete(path, line, open_joints, offsets)
+            if open_joints or not names or any(o is None for o in offsets):
+                raise ValueError(f"{path}, line {line}: MOTION before the hierarchy is complete")
             return names, parents, np.array(offsets), channels
         if key in ("ROOT", "JOINT"):
-            _check_joint(path, line, words, names, open_joints)
-            coming = len(names)
+            if len(words) < 2 or (key == "ROOT") == bool(names) or (key == "JOINT" and not open_joints):
+                raise ValueError(f"{path}, line {line}: {' '.join(words)!r}: one ROOT, then JOINTs within it")
+            next_open = len(names)
             names.append(" ".join(words[1:]).removesuffix("{").strip())
             parents.append(open_joints[-1] if open_joints else -1)
             offsets.append(None)
@@ -101,29 +103,14 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
         elif key == "}" and open_joints:
             open_joints.pop()
         elif key in ("OFFSET", "CHANNELS") and open_joints:
-            _enter(path, line, words, open_joints[-1], offsets, channels)
+            joint = open_joints[-1]
+            if key == "OFFSET" and joint >= 0:
+                offsets[joint] = numbers(path, line, words[1:], 3)
+            elif key == "CHANNELS":
+                channels[joint] = _channels(path, line, words)
         elif key not in ("HIERARCHY", "ROOT", "JOINT", "End"):
             raise ValueError(f"{path}, line {line}: {' '.join(words)[:60]!r} is not part of a BVH hierarchy")
     raise ValueError(f"{path}, line {line}: no MOTION; cut short, or not a BVH file")
-
-
-def _check_complete(path: str | Path, line: int, open_joints: list[int], offsets: list[np.ndarray | None]) -> None:
-    if open_joints or not offsets or any(offset is None for offset in offsets):
-        raise ValueError(f"{path}, line {line}: MOTION before the hierarchy is complete")
-
-
-def _check_joint(path: str | Path, line: int, words: list[str], names: list[str], open_joints: list[int]) -> None:
-    root = words[0] == "ROOT"
-    if len(words) < 2 or root == bool(names) or (not root and not open_joints):
-        raise ValueError(f"{path}, line {line}: {' '.join(words)!r}: one ROOT, then JOINTs within it")
-
-
-def _enter(path: str | Path, line: int, words: list[str], joint: int, offsets: list, channels: list[list[str]]) -> None:
-    """Enter a line of OFFSET or CHANNELS; `joint` is -1 for an end site."""
-    if words[0] == "CHANNELS":
-        channels[joint] = _channels(path, line, words)
-    elif joint >= 0:
-        offsets[joint] = numbers(path, line, words[1:], 3)
 
 
 def _channels(path: str | Path, line: int, words: list[str]) -> list[str]:

@@ -34,8 +34,8 @@ def push_out(vertices: np.ndarray, faces: np.ndarray, body: np.ndarray, triangle
         if signed.min() >= CLEARANCE / 2:
             break
         move, count = np.zeros_like(vertices), np.zeros(len(vertices))
-        wrong = (signed < CLEARANCE / 2).reshape(len(groups), -1)
-        for group, bad, direction in zip(groups, wrong, away.reshape(len(groups), -1, 3), strict=True):
+        too_close = (signed < CLEARANCE / 2).reshape(len(groups), -1)
+        for group, bad, direction in zip(groups, too_close, away.reshape(len(groups), -1, 3)):
             for column in group[bad].T:
                 np.add.at(move, column, direction[bad])
                 np.add.at(count, column, 1)

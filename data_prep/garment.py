@@ -146,7 +146,7 @@ def _fit(
 def _landmarks(body: Body, names: tuple[str, ...]) -> Landmarks:
     """Find the landmarks of a body by the names of its joints."""
     known = cmu_names(names)
-    joint = {name: np.asarray(place, np.float64) for name, place in zip(known, body.joints, strict=True)}
+    joint = {name: np.asarray(place, np.float64) for name, place in zip(known, body.joints)}
     needed = {"Neck", "Hips", "LowerBack"} | {
         side + bone for side in ("Left", "Right") for bone in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
     }

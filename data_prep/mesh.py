@@ -50,8 +50,8 @@ def clip(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> tuple
     vertices = np.concatenate([vertices, vertices[start] * (1 - share) + vertices[end] * share])
     inside = distance[faces] <= 0
     count = inside.sum(axis=1)
-    kept = faces[count == 3].tolist()
-    for face, within in zip(faces.tolist(), inside, strict=True):
+    triangles = faces[count == 3].tolist()
+    for face, within in zip(faces.tolist(), inside):
         if within.sum() not in (1, 2):
             continue
         odd = int(np.argmax(within)) if within.sum() == 1 else int(np.argmin(within))

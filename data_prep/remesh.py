@@ -68,7 +68,7 @@ def split(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.n
     middles = middle[of_face]
     count = (middles >= 0).sum(axis=1)
     pieces = [faces[count == 0]]
-    for (a, b, c), (x, y, z), n in zip(faces[count > 0], middles[count > 0], count[count > 0], strict=True):
+    for (a, b, c), (x, y, z), n in zip(faces[count > 0], middles[count > 0], count[count > 0]):
         # x on ab, y on bc, z on ca; turned until the single cut is on ab, or the two cuts are on ab and bc
         while n < 3 and not (x >= 0 and (n == 1 or y >= 0)):
             a, b, c, x, y, z = b, c, a, y, z, x

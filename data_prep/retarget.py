@@ -135,7 +135,7 @@ def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...]
     """
     frames = len(next(iter(local.values())))
     turned = np.zeros((frames, len(names), 3, 3))
-    for j, (name, parent) in enumerate(zip(names, body.parents, strict=True)):
+    for j, (name, parent) in enumerate(zip(names, body.parents)):
         turned[:, j] = turned[:, parent] if parent >= 0 else np.eye(3)
         if name in local:
             turned[:, j] = turned[:, j] @ local[name]

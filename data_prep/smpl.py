@@ -142,7 +142,7 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
             array = np.asarray(arrays[key], np.float64)
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {key} is not of numbers ({error})") from error
-        if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
             wanted = " x ".join("any" if n is None else str(n) for n in shape)
             raise ValueError(f"{path}: {key} has shape {array.shape}, expected {wanted}")
         if not array.size:

@@ -136,18 +136,16 @@ def read(path: str | Path) -> Mesh:
         raise ValueError(f"{path}: not a mesh that can be read ({_brief(error)}); export it as .obj or .glb") from error
     if not parts:
         raise ValueError(f"{path}: no triangles; export the mesh with its faces")
-    starts = np.cumsum([0, *(len(part.vertices) for _, part in parts)])[:-1]
+    starts = np.cumsum([0, *(len(part.vertices) for _, part in parts)])
     vertices = np.concatenate([np.asarray(part.vertices, np.float64) for _, part in parts])
-    faces = np.concatenate(
-        [np.asarray(part.faces, np.int64) + start for (_, part), start in zip(parts, starts, strict=True)]
-    )
-    wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(wrong):
-        raise ValueError(f"{path}: vertex {wrong[0] + 1} of {len(vertices)} is not finite: {vertices[wrong[0]]}")
+    faces = np.concatenate([np.asarray(part.faces, np.int64) + start for (_, part), start in zip(parts, starts)])
+    infinite = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(infinite):
+        raise ValueError(f"{path}: vertex {infinite[0] + 1} of {len(vertices)} is not finite: {vertices[infinite[0]]}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path}: a face names vertex {faces.max() + 1} of {len(vertices)}")
     objects = {name: np.zeros(len(vertices), bool) for names, _ in parts for name in names}
-    for (names, part), start in zip(parts, starts, strict=True):
+    for (names, part), start in zip(parts, starts):
         for name in names:
             objects[name][np.asarray(part.faces) + start] = True
     return Mesh(vertices, faces, np.concatenate([_red(part) for _, part in parts]), objects)

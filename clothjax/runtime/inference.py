@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.files import storage
-from clothjax.material import configured_material
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import Normalizers
 from clothjax.runtime import trained
@@ -30,9 +29,6 @@ from clothjax.types import Array, Body, Garment, Material, Motion, Pose
 
 FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
 HIGHEST = jax.lax.Precision.HIGHEST
-
-
-NO_KERNEL: Any = None  # of the readers of a folded code
 
 
 class Layer(NamedTuple):
@@ -365,16 +361,13 @@ def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
 @jax.jit
 def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
     """Take a `step` for every character of a `crowd`: states, poses and vertices have a leading axis [N]."""
-    return jax.vmap(partial(step, vertices=True), (_axes(model), 0, 0))(model, states, poses)
 
     def one(wearer: Wearer, state: State, pose: Pose) -> tuple[State, Array]:
         state, vertices = step(dataclasses.replace(model, wearer=wearer), state, pose, vertices=True)
         assert vertices is not None
         return state, vertices
 
-def _axes(model: Model) -> Model:
-    """Return the axes of a crowd's model to map over: only the character has one."""
-    return dataclasses.replace(model, network=None, faces=None, wearer=0)
+    return jax.vmap(one)(model.wearer, states, poses)
 
 
 def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
