@@ -141,7 +141,7 @@ def count_nonfinite(count: int, seed: int = 0) -> dict[str, dict[str, int]]:
 def _counts(values: tuple, count: int) -> dict[str, int]:
     wrong = [~np.isfinite(np.asarray(x, np.float64).reshape(count, -1)).all(axis=1) for x in values]
     return {"configurations": count} | dict(
-        zip(("energy", "gradient", "hessian"), (int(w.sum()) for w in wrong), strict=True)
+        zip(("energy", "gradient", "hessian"), (int(w.sum()) for w in wrong), strict=False)
     )
 
 
