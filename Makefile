@@ -11,7 +11,7 @@ API := runs/api
 MODULES := $(subst /,.,$(patsubst %.py,%,$(filter-out %__init__.py %__main__.py,$(wildcard clothjax/*.py clothjax/*/*.py))))
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
-.PHONY: quickstart demo docs test test-slow lint wheel
+.PHONY: quickstart demo docs test test-slow lint types wheel
 
 quickstart: $(INSTALLED)  ## train both stages on the embedded body, evaluate, render, export
 	@$(PYTHON) -m experiments.quickstart
@@ -28,10 +28,12 @@ test: $(INSTALLED)  ## the tests of every day
 test-slow: $(INSTALLED)  ## the long ones
 	@$(PYTHON) -m pytest -m slow
 
-lint: $(INSTALLED)  ## style, and types of the library
+lint: $(INSTALLED)  ## style
 	@$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	$(PYTHON) -m pyright --pythonpath $(PYTHON)
+
+types: $(INSTALLED)  ## types of the library
+	@$(PYTHON) -m pyright --pythonpath $(PYTHON)
 
 wheel: $(INSTALLED)  ## build the wheel, install it elsewhere, and use a garment that comes with it
 	@rm -rf dist $(VENV)/wheel
