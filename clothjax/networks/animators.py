@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import Config
 from clothjax.networks import baselines, decoder, mlp, normalisation, phi
+from clothjax.networks.message_passing import Block
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import Normalizers
 from clothjax.networks.psi import Psi, constant_inputs, window_inputs
@@ -29,11 +31,17 @@ def memory_size(scene: Scene, config: Config) -> int:
     return left * channels
 
 
-def phi_animator(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
-    """Make Phi, of `params` and `statistics`, the animator of a character's garment."""
+def phi_animator(
+    model: dict, scene: Scene, character: Character, config: Config, block: type[nn.Module] = Block
+) -> Animator:
+    """Make Phi, of `params` and `statistics`, the animator of a character's garment.
+
+    Args:
+        block: message-passing block; `partial(phi_animator, block=Mine)` makes an animator of another one.
+    """
 
     def step(inputs: StepInput) -> StepOutput:
-        return phi.step(model, scene, character, inputs, config.model, config.material)
+        return phi.step(model, scene, character, inputs, config.model, config.material, block)
 
     return Animator(memory_size(scene, config), step)
 

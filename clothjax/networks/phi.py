@@ -93,11 +93,13 @@ def step(
     inputs: StepInput,
     config: ModelConfig,
     material: MaterialConfig,
+    block: type[nn.Module] = message_passing.Block,
 ) -> StepOutput:
     """Take one step of Phi: return the next positions, their latent code, and the features.
 
     Args:
         model: `params` and `statistics`.
+        block: message-passing block, as of `Phi`.
     """
     params = model["params"]
     state, window, potential = inputs.state, inputs.window, inputs.potential
@@ -123,7 +125,7 @@ def step(
         config, material,
     )  # fmt: skip
     seen = jax.lax.stop_gradient(seen)
-    output: Any = Phi(config, scene).apply(model, seen, guess)
+    output: Any = Phi(config, scene, block).apply(model, seen, guess)
     latent, displaced = output
     return StepOutput(decoder.vertices(displaced, character.template, window.following.garment), latent, seen)
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ from clothjax.material import configured_material
 from clothjax.networks import animators, baselines, decoder, graph_features, mlp, phi, psi
 from clothjax.networks.animators import MakeAnimator
 from clothjax.networks.graph_features import Features
+from clothjax.networks.message_passing import Block
 from clothjax.physics import descent
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.simulation import characters, rollout, time_step
@@ -73,18 +75,21 @@ def optimizer(config: Config) -> optax.GradientTransformation:
     )
 
 
-def init(scene: Scene, clips: Clips, config: Config, shapes: Array | None = None) -> TrainingState:
+def init(
+    scene: Scene, clips: Clips, config: Config, shapes: Array | None = None, block: type[nn.Module] = Block
+) -> TrainingState:
     """Return the state before the first step.
 
     Args:
         shapes: [K, V, 3] m, initial blend shapes; smooth ones by default.
+        block: message-passing block; `make_update` then needs an animator of the same.
     """
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     basis = laplacian_shapes.laplacian(scene, config) if shapes is None else shapes
     example = jax.eval_shape(lambda k: first_step(scene, begin(k, scene, clips, config), clips, config), key).seen
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), example)
-    model = jax.jit(lambda k: phi.Phi(config.model, scene).init(k, zeros))(model_key)
+    model = jax.jit(lambda k: phi.Phi(config.model, scene, block).init(k, zeros))(model_key)
     params = model["params"]
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
     params["garment"]["blendshapes"] = jnp.asarray(0.1 * basis)

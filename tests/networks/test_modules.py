@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from functools import partial
 
 import flax.linen as nn
 import flax.serialization
@@ -14,6 +15,7 @@ from toy import assert_same, small
 from clothjax.config import Config, PeerConfig, Stage1Config
 from clothjax.files import checkpoint
 from clothjax.networks import baselines
+from clothjax.networks.animators import phi_animator
 from clothjax.networks.graph_features import Features
 from clothjax.networks.message_passing import Block, Latents
 from clothjax.networks.mlp import MLP
@@ -83,6 +85,19 @@ def test_a_block_is_exchanged_for_another(toy):
     assert set(variables["params"]["processor"]["0"]) == {"edge_coarse1", "edge_mesh", "edge_world", "node"}
     code, moved = other.apply(changed, seen)
     assert code.shape == (phi.apply(variables, seen)[0]).shape and np.isfinite(moved).all()
+
+
+def test_a_training_step_is_of_the_block_it_is_given():
+    whole = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
+    reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
+    state = stage1.init(whole.scene, reel, whole.config, block=Plain)
+    before = jax.device_get(state.params["processor"]["0"]["node"])
+    update = stage1.make_update(whole.scene, reel, whole.config, 1, 3, animator=partial(phi_animator, block=Plain))
+    state, metrics = update(state)
+    assert np.isfinite(metrics["loss"]).all()
+    after = state.params["processor"]["0"]["node"]
+    assert set(state.params["processor"]["0"]) == {"node"}
+    assert any((a != b).any() for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after)))
 
 
 def test_a_block_alone_is_a_module(toy):
