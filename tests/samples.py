@@ -348,7 +348,13 @@ def settings(network: str, **stage) -> Config:
 # Commands of the documents
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = ("README.md", "experiments/README.md", "clothjax/export/README.md", "data_prep/README.md")
+DOCUMENTS = (
+    "README.md",
+    "experiments/README.md",
+    "clothjax/README.md",
+    "clothjax/export/README.md",
+    "data_prep/README.md",
+)
 SMALL = (
     "--shapes.sequences 0 --model.descent_samples 0 --model.width 8 --model.blendshapes 24 --stage1.steps 20 "
     "--stage2.steps 20 --stage2.sequences 2 --stage2.frames 8 --stage2.rollout 2 --tuning.steps 20 --tuning.pool 2 "

@@ -87,8 +87,7 @@ def init(
     clips = jax.tree.map(jnp.asarray, clips)
     key, model_key, pool_key = jax.random.split(jax.random.key(config.stage1.seed), 3)
     basis = laplacian_shapes.laplacian(scene, config) if shapes is None else shapes
-    example = jax.eval_shape(lambda k: first_step(scene, begin(k, scene, clips, config), clips, config), key).seen
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), example)
+    zeros = blank_features(scene, clips, config)
     model = jax.jit(lambda k: phi.Phi(config.model, scene, block).init(k, zeros))(model_key)
     params = model["params"]
     # a tenth of a unit weight: the decoder's first steps then move the cloth by millimetres
@@ -96,6 +95,15 @@ def init(
     if config.model.latent_update == "descent":
         params["inverse_hessian"] = jax.jit(lambda p: rest_inverse_hessian(p, scene, config))(params["garment"])
     return initial_state(params, model["statistics"], key, pool_key, scene, clips, config)
+
+
+def blank_features(scene: Scene, clips: Clips, config: Config) -> Features:
+    """Return zeros with the shapes of Phi's features, to initialise or to tabulate Phi with."""
+
+    def seen(key):
+        return first_step(scene, begin(key, scene, clips, config), clips, config).seen
+
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen, jax.random.key(0)))
 
 
 def init_baseline(scene: Scene, clips: Clips, input_joints: np.ndarray, shapes: Array, config: Config) -> TrainingState:

@@ -24,18 +24,13 @@ from clothjax.networks.psi import Psi
 from clothjax.runtime import trained
 from clothjax.simulation import assembly
 from clothjax.simulation.assembly import Experiment
-from clothjax.training import pool, stage1
+from clothjax.training import stage1
 
 
 def features(whole: Experiment) -> Features:
     """Zeros in the place of what Phi sees."""
-    reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
-
-    def seen(key):
-        simulation = pool.begin(key, whole.scene, reel, whole.config)
-        return stage1.first_step(whole.scene, simulation, reel, whole.config).seen
-
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen, jax.random.key(0)))
+    clips = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
+    return stage1.blank_features(whole.scene, clips, whole.config)
 
 
 @pytest.fixture(scope="module")
