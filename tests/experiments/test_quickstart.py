@@ -28,7 +28,7 @@ def test_the_quickstart_meets_its_bars(report):
 @pytest.mark.slow
 @pytest.mark.xfail(
     raises=AssertionError,
-    reason="9.2 mm, as README says: 4.2 from a Phi with a hold gap of 0.71, when the bar was set; now Phi has 0.26",
+    reason="9.2 mm, as RESULTS.md says: 4.2 from a Phi with a hold gap of 0.71, when the bar was set; now Phi has 0.26",
 )
 def test_psi_is_near_phi_in_the_quickstart(report):
     assert report["evaluation"]["psi"]["psi_phi_mm"] <= 8
