@@ -13,7 +13,7 @@ CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 .PHONY: quickstart demo docs test test-slow lint types wheel
 
-quickstart: $(INSTALLED)  ## train both stages on the embedded body, evaluate, render, export
+quickstart: $(INSTALLED)  ## train all stages on the embedded body, evaluate, render, export
 	@$(PYTHON) -m experiments.quickstart
 
 demo: $(INSTALLED)  ## a character that you steer, live in the browser

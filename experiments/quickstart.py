@@ -3,7 +3,7 @@
     python -m experiments.quickstart                      # the same as `make quickstart`
     python -m experiments.quickstart --stage1.steps 400   # any setting may be changed
 
-It writes into `runs/quickstart/`: the checkpoints of both stages, report.json, report.md, comparison.png, walk.webp,
+It writes into `runs/quickstart/`: the checkpoints of all stages, report.json, report.md, comparison.png, walk.webp,
 tshirt.onnx (with tshirt.json, how to drive it) and tshirt.glb. Run again, it goes on where it stopped.
 """
 

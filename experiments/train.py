@@ -1,4 +1,4 @@
-"""Train both stages of an experiment: the same program as `python -m clothjax train`.
+"""Train all stages of a run: the same program as `python -m clothjax train`.
 
     python -m experiments.train configs/quickstart.yaml
 

@@ -1,4 +1,4 @@
-"""Write Psi of a run, or a garment that comes with the library, for another runtime, and compare it with jax.
+"""Write a model, of a run or of a garment that comes with the library, for another runtime; compare it with jax.
 
     python -m clothjax convert runs/quickstart --to onnx --int8
     python -m clothjax convert skirt --to stablehlo --out skirt.stablehlo

@@ -5,13 +5,13 @@
     python -m clothjax evaluate skirt tshirt --motions walk_3
     python -m clothjax evaluate all --json report.json
 
-Three stages are measured: `lbs` (plain skinning), `phi` (stage 1) and `psi` (stage 2). For a baseline's run they are
-`lbs` and its network, by name. No state is borrowed from the solver: every number is about the stage's own trajectory,
-with the configured material and the betas of `evaluation.betas_seed`. Averages are over frames; medians and maxima
-stand beside them.
+Three methods are measured: `lbs` (plain skinning), `phi` and `psi`, after all of its training. For a baseline's run
+they are `lbs` and its network, by name. No state is borrowed from the solver: every number is about the method's own
+trajectory. Material and betas are the configured ones, of `evaluation.betas_seed`. Averages are over frames; medians
+and maxima stand beside them.
 
     energy_gap      (E - E_min) / (E_skinned - E_min). E is the full incremental potential at unit physical weights
-                    given the stage's own two previous frames, E_min the reference solver's minimum from the same two.
+                    given the method's own two previous frames, E_min the reference solver's minimum from the same two.
                     0 is the solver, 1 plain skinning. The mean is of sums over the frames sampled.
     hold_gap        the same with E_hold for E_skinned, where E_hold is of persistence: the last canonical displacement
                     again. 1 is no dynamics at all.
@@ -36,7 +36,7 @@ Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penet
 
 The report of one folder is written into it, as `evaluation.json`. For names, or several folders, it has the means over
 garments under `mean` and the report of each under its name. Validation motions that are not present are then left out:
-motion capture does not come with the library.
+motion capture does not come with the library. METHOD.md has the formulas of the measures, under Measures.
 """
 
 import json

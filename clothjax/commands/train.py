@@ -1,13 +1,13 @@
-"""Train both stages of an experiment; run it again to go on where it stopped.
+"""Train all stages of a run: Phi, Psi and its fine-tuning, or a baseline. Run it again to go on where it stopped.
 
     python -m clothjax train configs/quickstart.yaml
     python -m clothjax train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
     python -m clothjax train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
     python -m clothjax train --garment skirt_1000 --stage1.steps 2000 --directory runs/skirt     # without a file
 
-It writes `stage1/`, `stage2/` and, for fine-tuning if its steps are not 0, `tuning/` into the run's folder, each with
-checkpoints, metrics.jsonl and training.json. Settings that neither the file nor the command line gives have the
-library's defaults.
+It writes `stage1/` (Phi), `stage2/` (Psi) and `tuning/` (its fine-tuning, if `tuning.steps` is not 0) into the run's
+folder, each with checkpoints, metrics.jsonl and training.json. A baseline has `stage1/` alone. Settings that neither
+the file nor the command line gives have the library's defaults.
 
 `--devices`, a number or `auto`, spreads the simulations of an update over devices. The processes of a SLURM, Open MPI
 or Kubernetes job train together, unless `--processes alone` is given. Elsewhere give each
