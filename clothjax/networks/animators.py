@@ -1,4 +1,4 @@
-"""Phi, Psi and the baselines, each as a function that moves a garment by one frame."""
+"""Phi, Psi and the baselines as animators: each takes one time step of a garment."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,11 +20,11 @@ from clothjax.simulation.scene import Scene
 from clothjax.types import Array
 
 MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
-"""An animator of `params` and `statistics`, for a character in a scene."""
+"""A function from a network's variables (`params`, `statistics`), scene, character and settings to an animator."""
 
 
 def memory_size(scene: Scene, config: Config) -> int:
-    """Count the numbers L that an animator carries from frame to frame: the code, or a baseline's memory."""
+    """Return how many numbers L an animator carries from frame to frame, as a code or a baseline's memory."""
     if config.peer.network:
         return baselines.memory_size(config)
     left, channels = phi.latent_size(scene, config.model)
@@ -34,9 +34,10 @@ def memory_size(scene: Scene, config: Config) -> int:
 def phi_animator(
     model: dict, scene: Scene, character: Character, config: Config, block: type[nn.Module] = Block
 ) -> Animator:
-    """Make Phi, of `params` and `statistics`, the animator of a character's garment.
+    """Return Phi as the animator of a character's garment.
 
     Args:
+        model: Phi's `params` and `statistics`.
         block: message-passing block; `partial(phi_animator, block=Mine)` makes an animator of another one.
     """
 
@@ -47,10 +48,10 @@ def phi_animator(
 
 
 def baseline_animator(input_joints: np.ndarray) -> MakeAnimator:
-    """Return a function that makes a baseline's network, of `params`, the animator of a character's garment.
+    """Return the function that makes an animator of a baseline's network; it reads `params` alone.
 
     Args:
-        input_joints: indices of the joints that are inputs.
+        input_joints: [Jk] indices of the joints that are inputs.
     """
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
@@ -70,19 +71,19 @@ def baseline_animator(input_joints: np.ndarray) -> MakeAnimator:
 
 
 class Preconditioners(NamedTuple):
-    """Factors of the gradients of Psi's first and last layer.
+    """Matrices that multiply the gradients of Psi's first and last layer in fine-tuning.
 
     Together they are a Kronecker-factored preconditioner (Martens and Grosse 2015) of the first layer's inputs and the
     last layer's outputs.
     """
 
-    pose: Array  # [P, P] of normalised pose inputs
-    code: Array | None  # [L, L] of normalised codes
+    pose: Array  # [P, P] for the first layer, over normalised pose inputs
+    code: Array | None  # [L, L] for the last layer, over normalised codes; None: not preconditioned
 
 
 @jax.custom_vjp
 def precondition(matrix: Array, code: Array) -> Array:
-    """Return the same code [L]; its gradient is multiplied by a symmetric matrix [L, L]."""
+    """Return `code` [L] unchanged; in the backward pass its gradient is multiplied by `matrix` [L, L], symmetric."""
     del matrix  # of the gradient alone
     return code
 
@@ -91,7 +92,15 @@ precondition.defvjp(lambda matrix, code: (code, matrix), lambda matrix, g: (jnp.
 
 
 def learning_from(params: Params, inputs: Array) -> Params:
-    """Return the same predictor; its first layer gets its gradient as if it had been given other inputs [N]."""
+    """Return parameters of the latent predictor that give the same outputs, but another gradient of the first kernel.
+
+    The gradient of the kernel of `dense_0` is that of a layer which had read `inputs`, such as preconditioned ones, in
+    place of its own inputs.
+
+    Args:
+        params: of the latent predictor.
+        inputs: [N], as many as the layer has.
+    """
     first, stop = params["dense_0"], jax.lax.stop_gradient
     outputs = stop(inputs) @ first["kernel"]
     return params | {"dense_0": {"kernel": stop(first["kernel"]), "bias": first["bias"] + (outputs - stop(outputs))}}
@@ -100,14 +109,15 @@ def learning_from(params: Params, inputs: Array) -> Params:
 def psi_animator(
     garment: dict, normalizers: Normalizers, input_joints: np.ndarray, gradients: Preconditioners | None = None
 ) -> MakeAnimator:
-    """Return a function that makes Psi, of `params`, the animator of a character's garment, with a frozen decoder.
+    """Return the function that makes an animator of Psi: its `params` are trained, the decoder is frozen.
 
     Codes are clipped to their range as at run time; gradients pass as if none had been out of it.
 
     Args:
-        garment: parameters of the decoder.
-        input_joints: indices of the joints that are inputs.
-        gradients: preconditioners, if any.
+        garment: parameters of the decoder with its blend shapes.
+        normalizers: scales of codes [L] and pose inputs [P].
+        input_joints: [Jk] indices of the joints that are inputs.
+        gradients: preconditioners of the gradients, if any.
     """
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:

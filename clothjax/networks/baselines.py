@@ -2,8 +2,8 @@
 
 NCS (Bertiche et al. 2022) and the recurrent network of SNUG (Santesteban et al. 2022) go from the pose to the garment
 without its state; gated recurrent units remember the past. Both have Psi's inputs: the pose of Psi's joints without
-its heading, and the character's betas and material. SNUG's pose is in 6-D codes, not in axis-angle vectors. NCS's
-motion augmentation is left out, as in its published settings.
+its heading, and the character's betas and material. SNUG's pose is in the 6D representation, not in axis-angle
+vectors. NCS's motion augmentation is left out, as in its published settings.
 """
 
 import flax.linen as nn
@@ -23,7 +23,7 @@ GRUS = 4  # SNUG's recurrent layers
 
 
 def memory_size(config: Config) -> int:
-    """Count the numbers that a network carries from frame to frame."""
+    """Return how many numbers the configured network carries from frame to frame."""
     if config.peer.network == "direct":
         return config.model.latent
     return config.peer.width * (GRUS if config.peer.network == "snug" else 1)
@@ -40,7 +40,7 @@ def network(config: Config, vertices: int) -> nn.Module:
 
 
 def init(key: Array, joints: int, constants: int, shapes: Array, config: Config) -> Params:
-    """Return initial parameters.
+    """Return initial parameters of the configured network.
 
     Args:
         joints: number of joints that are inputs.
@@ -64,9 +64,11 @@ def inputs(
 ) -> dict[str, Array]:
     """Compute a network's inputs from three poses.
 
-    These are NCS's `static` [S] and `dynamic` [Jk, 12], SNUG's `inputs` [N], or Psi's `pose` [P] and `constants` [C].
+    NCS has `static` [9 Jk + C] and `dynamic` [Jk, 12], SNUG `inputs` [6 Jk + 3 + C], Psi `pose` [P] and `constants`
+    [C]. Jk joints are inputs.
 
     Args:
+        poses: window of previous, current and following pose, leading axis 3.
         joints: [J, 3] m, of the shaped body.
         constants: [C] of the character.
         input_joints: indices of the joints that are inputs, the root first.
@@ -98,7 +100,7 @@ def joint_inputs(
     """Compute NCS's inputs of every joint, in the joint's own frame.
 
     Returns:
-        Static inputs [Jk, 9]: its 6-D rotation and the direction down. Dynamic inputs [Jk, 12]: their rate of change,
+        Static inputs [Jk, 9]: its 6D rotation and the direction down. Dynamic inputs [Jk, 12]: their rate of change,
         and its acceleration in m/s^2.
     """
 
@@ -115,7 +117,7 @@ def joint_inputs(
 
 
 class Layers(nn.Module):
-    """Dense layers of these sizes, a ReLU behind each, with NCS's own random numbers: N(0, 0.05)."""
+    """Dense layers of these sizes with a ReLU behind each; kernels start as in NCS, with N(0, 0.05)."""
 
     sizes: tuple[int, ...]
     bias: bool = True
@@ -129,14 +131,19 @@ class Layers(nn.Module):
 
 
 class NCS(nn.Module):
-    """The network of NCS, its blend shapes initialised as Glorot and Bengio."""
+    """The network of NCS (Bertiche et al. 2022): static and dynamic encoder, decoder, learned blend shapes."""
 
     config: Config
     vertices: int
 
     @nn.compact
     def __call__(self, memory: Array, static: Array, dynamic: Array) -> tuple[Array, Array]:
-        """Return displacements [V, 3] m and the dynamic code [W], the memory: zero as long as nothing moves."""
+        """Return the canonical displacement [V, 3] m of the next frame, and the next memory.
+
+        Args:
+            memory: [W], the state of a gated recurrent unit without biases: it stays zero while nothing moves.
+            static, dynamic: [9 Jk + C] and [Jk, 12], as `inputs` gives them.
+        """
         settings, width = self.config.peer, self.config.peer.width
         static = Layers((*STATIC, width), name="static")(static)
         local = Layers((LOCAL, LOCAL), bias=False, name="local")(dynamic)
@@ -151,13 +158,13 @@ class NCS(nn.Module):
 
 
 class Units(nn.Module):
-    """Gated recurrent units, one after the other."""
+    """Four gated recurrent units, one after the other."""
 
     width: int
 
     @nn.compact
     def __call__(self, memory: Array, x: Array) -> Array:
-        """Return the new states [4 W] from those before and the inputs [N]."""
+        """Return the next states [4 W] of all units, from their states [4 W] and the inputs [N] of the first."""
         states = []
         for index, state in enumerate(jnp.split(memory, GRUS)):
             x = GRU(self.width, name=str(index))(state, x)
@@ -166,14 +173,19 @@ class Units(nn.Module):
 
 
 class SNUG(nn.Module):
-    """The recurrent network of SNUG."""
+    """The recurrent network of SNUG (Santesteban et al. 2022)."""
 
     config: Config
     vertices: int
 
     @nn.compact
     def __call__(self, memory: Array, inputs: Array) -> tuple[Array, Array]:
-        """Return displacements [V, 3] m and the states [4 W] of its units."""
+        """Return the canonical displacement [V, 3] m of the next frame, and the next memory [4 W].
+
+        Args:
+            memory: [4 W], the current states of the units.
+            inputs: [N], as `inputs` gives them.
+        """
         width = self.config.peer.width
         memory = Units(width, name="units")(memory, inputs)
         output = nn.Dense(3 * self.vertices, kernel_init=nn.initializers.glorot_normal(), name="output")
@@ -184,7 +196,10 @@ class SNUG(nn.Module):
 
 
 class Direct(nn.Module):
-    """Psi without normalisers: there is no teacher to measure the codes of."""
+    """Psi trained on the physics alone: the latent predictor and a decoder in one network (`peer.network: direct`).
+
+    Nothing is normalised, because there is no teacher whose codes could be measured.
+    """
 
     config: Config
     vertices: int
@@ -194,7 +209,12 @@ class Direct(nn.Module):
         self.garment = decoder.Decoder(self.config.model, self.config.model.latent, self.vertices)
 
     def __call__(self, memory: Array, pose: Array, constants: Array) -> tuple[Array, Array]:
-        """Return displacements [V, 3] m and the code [L], which is the memory."""
+        """Return the canonical displacement [V, 3] m of the next frame, and the next code [L].
+
+        Args:
+            memory: [L], the current code.
+            pose, constants: [P] and [C], as `inputs` gives them.
+        """
         code = self.predictor(memory, pose, constants)
         return self.garment(code, jnp.ones(self.vertices)), code
 
@@ -203,14 +223,17 @@ class Direct(nn.Module):
 
 
 class GRU(nn.Module):
-    """A gated recurrent unit (Cho et al. 2014), its reset gate after the product, with or without biases."""
+    """A gated recurrent unit (Cho et al. 2014) of W = `width` numbers, with or without biases.
+
+    The reset gate multiplies the product of the state with its kernel, not the state itself.
+    """
 
     width: int
     bias: bool = True
 
     @nn.compact
     def __call__(self, state: Array, x: Array) -> Array:
-        """Return the new state [W] from the one before and the inputs [N]."""
+        """Return the next state [W] from the current one [W] and inputs [N]."""
 
         def product(name: str, rows: Array, kernel) -> list[jax.Array]:
             return jnp.split(nn.Dense(3 * self.width, self.bias, kernel_init=kernel, name=name)(rows), 3)

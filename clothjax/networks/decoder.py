@@ -12,7 +12,7 @@ from clothjax.types import Array
 
 
 class Decoder(nn.Module):
-    """Network from a latent code [L] to a canonical displacement [V, 3] m.
+    """Network from a code [L] to the canonical displacement [V, 3] m of a garment (METHOD.md, Decoder).
 
     The last layer is near zero at first: a decoder of ordinary size would start the garment metres away, with 4e4 J
     instead of a skinned garment's few. The blend shapes are zero at first: training gives them a basis.
@@ -31,7 +31,12 @@ class Decoder(nn.Module):
             self.skip = self.param("skip", lambda _, *shape: jnp.eye(*shape), self.latent, config.blendshapes)
 
     def __call__(self, latent: Array, free: Array) -> Array:
-        """Compute the canonical displacement sum_k w_k D_k [V, 3] m of a latent code [L]; zero where `free` [V] is."""
+        """Return the canonical displacement sum_k w_k D_k [V, 3] m: blend weights w times blend shapes D.
+
+        Args:
+            latent: [L], the code.
+            free: [V], 1 for a vertex that moves and 0 for a pinned one, whose displacement is zero (`phi.free`).
+        """
         shapes = self.blendshapes
         flat = jnp.matmul(
             self.blend_weights(latent), shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST
@@ -39,7 +44,7 @@ class Decoder(nn.Module):
         return flat.reshape(shapes.shape[1:]) * free[:, None]
 
     def blend_weights(self, latent: Array) -> Array:
-        """Compute the blend-shape weights [K] of a latent code [L]."""
+        """Return the blend weights [K] of a code [L]."""
         weights = self.decoder(latent)
         if self.config.decoder_skip:
             weights = weights + latent @ self.skip
@@ -54,10 +59,16 @@ def init(key: Array, latent: int, basis: Array, config: ModelConfig) -> Params:
 
 
 def of(params: Params, config: ModelConfig) -> Decoder:
-    """Return the decoder that has such parameters."""
+    """Return the decoder module of given parameters; it reads the sizes L and V from their shapes."""
     return Decoder(config, params["decoder"]["dense_0"]["kernel"].shape[0], params["blendshapes"].shape[1])
 
 
 def vertices(displaced: Array, template: Array, transforms: Array) -> Array:
-    """Return garment vertices [V, 3] m: the displaced template [V, 3], skinned by transforms [V, 3, 4]."""
+    """Return the posed vertices [V, 3] m of a garment, by skinning.
+
+    Args:
+        displaced: [V, 3] m, the canonical displacement.
+        template: [V, 3] m, the shaped garment in the canonical pose.
+        transforms: [V, 3, 4] skinning transforms of its vertices.
+    """
     return skinning.apply(transforms, template + displaced)

@@ -1,6 +1,7 @@
-"""Node and edge features of Phi, in the root's heading frame, and their running normalisation.
+"""Node and edge features of Phi, not yet normalised (METHOD.md, Phi).
 
-Nothing here changes when the scene is moved, or turned about the vertical.
+Vectors are in the heading frame of the root, or in the canonical pose. Nothing here changes when the scene is moved, or
+turned about the vertical. Phi normalises the features by running statistics (`normalisation.py`).
 """
 
 from typing import NamedTuple
@@ -21,24 +22,28 @@ BODY_RADIUS = 0.03  # m, garment and body vertices closer than this are joined
 
 
 class WorldFeatures(NamedTuple):
-    """Features of body nodes, and of pairs of a garment vertex with the body vertex nearest to it."""
+    """Features of Q body nodes, and of V pairs: each garment vertex with the body vertex nearest to it."""
 
-    nodes: Array  # [S, N], a slot for every body vertex that may be nearest to some garment vertex
-    slots: Array  # [V] int32, the slot of each garment vertex
+    nodes: Array  # [Q, N], a row for every body vertex that may be nearest to some garment vertex
+    slots: Array  # [V] int32, the row of `nodes` that each garment vertex is paired with
     active: Array  # [V] bool, whether the pair is close enough to count
-    to_garment: Array  # [V, W]
-    to_body: Array  # [V, W] the same pair in the other direction
+    to_garment: Array  # [V, 9] of the edge from the body node to the garment vertex
+    to_body: Array  # [V, 9] of the edge in the other direction
 
 
 class Features(NamedTuple):
-    """Raw inputs of the encoders."""
+    """The features of one time step, as Phi's encoders read them after normalisation."""
 
-    nodes: Array  # [V, N]
-    edges: dict[str, jax.Array]  # [E, M] by edge set
+    nodes: Array  # [V, N] of the garment
+    edges: dict[str, jax.Array]  # [E, M] by edge set: `mesh`, `coarse0`, ...
     world: WorldFeatures | None  # None where there is no body
 
     def columns(self) -> dict[str, list[Array]]:
-        """Return the features by kind: those of a kind share columns, and so statistics."""
+        """Return the arrays by what they are normalised with: `nodes`, `mesh` and, where there is a body, `world`.
+
+        All arrays of one name have the same columns and are normalised by the same statistics. They are garment and
+        body nodes [V, N] and [Q, N], edges of all edge sets [E, M], and pairs in both directions [V, 9].
+        """
         nodes, pairs = [self.nodes], {}
         if self.world is not None:
             nodes.append(self.world.nodes)
@@ -132,10 +137,15 @@ def _world(
 
 
 def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Array) -> tuple[Array, Array]:
-    """Compute features [V, 9] of the pairs of garment and body vertices, towards the body and towards the garment.
+    """Compute features [V, 9] of the edges between garment vertices and body vertices, in both directions.
 
     Args:
         offset_now, offset_next: [V, 3] m from the body vertex, at this frame and at the next, to the garment vertex.
+        turn: [3, 3] into the frame of the features.
+        timestep: s.
+
+    Returns:
+        Features of the edges towards the body, and of those towards the garment.
     """
 
     def one(sign):
@@ -181,12 +191,14 @@ def _canonical(
 
 
 def mesh_edges(senders, receivers, points, template, turn, timestep, inputs) -> jax.Array:
-    """Compute features of edges: relative positions now and at rest, [E, 12], and the strain of each guess.
+    """Compute features [E, M] of edges: relative positions now and at rest, the strain of each guess, and the material.
 
     Args:
+        senders, receivers: [E] vertex indices.
         points: [V, 3] m by name: `now`, and the guesses `held` and `drifted` where there are any.
         template: [V, 3] m, at rest.
         turn: [3, 3] into the frame of the features.
+        timestep: s.
         inputs: [3] the material, or [0].
     """
     rest = template[senders] - template[receivers]

@@ -11,11 +11,14 @@ from clothjax.types import Array
 
 
 class Table(Protocol):
-    """The neighbours of a block: the inputs, of N, that each of P outputs reads, as in `mesh_hierarchy.Level`."""
+    """The neighbours that a block reads: row p lists up to K of the N input vertices, which output vertex p reads.
+
+    `scene.Table` and `mesh_hierarchy.Level` are such tables.
+    """
 
     @property
     def ids(self) -> Array:
-        """[P, K] int32; padding is any number."""
+        """[P, K] int32, indices of input vertices; padding is any number."""
         ...
 
     @property
@@ -85,7 +88,7 @@ class MeshConvolution(nn.Module):
 
 
 class Convolution(nn.Module):
-    """Blocks of mesh convolution, one after the other."""
+    """Blocks of mesh convolution, one after the other, each with a ReLU."""
 
     features: tuple[int, ...]  # of each block
     bases: int

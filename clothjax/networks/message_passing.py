@@ -23,19 +23,19 @@ Graphs = Mapping[str, jraph.GraphsTuple]  # edge sets, sorted by receiver
 
 
 class World(NamedTuple):
-    """The body beside a garment, and the pairs of a garment vertex with the body node nearest to it."""
+    """Latents of Q body nodes beside a garment, and of V pairs: a garment vertex with the node nearest to it."""
 
-    nodes: Array  # [S, W] latents of the body nodes
+    nodes: Array  # [Q, W] latents of the body nodes
     slots: Array  # [V] int32, the body node of each garment vertex
     active: Array  # [V] bool, the pairs that pass messages
     pairs: dict[str, jax.Array]  # latents [V, W]: `to_garment`, and `to_body` if body nodes are to be updated
 
 
 class Latents(NamedTuple):
-    """The latents that pass from block to block."""
+    """The latents, W numbers a row, that pass from block to block."""
 
     nodes: Array  # [V, W] of the garment
-    body: Array | None  # [S, W]; None where there is no body
+    body: Array | None  # [Q, W] of the body; None where there is no body
     edges: dict[str, Array]  # [E, W] by edge set
     pairs: dict[str, Array]  # [R, W] of the vertices in reach, as in `World`
 
@@ -44,7 +44,10 @@ class Latents(NamedTuple):
 
 
 class Block(nn.Module):
-    """One residual message-passing block. First layers are applied before their inputs are gathered or concatenated."""
+    """One residual message-passing block (METHOD.md, Graph network), on edge sets and pairs with the body.
+
+    The first layer of each MLP multiplies node rows before these are gathered: there are fewer nodes than edges.
+    """
 
     width: int
     layers: int
@@ -60,10 +63,11 @@ class Block(nn.Module):
         self.node = MLP(((1 + len(names)) * self.width, *hidden))
 
     def __call__(self, latents: Latents, slots: Array | None, active: Array | None) -> tuple[Latents, None]:
-        """Return the latents after the block.
+        """Return the latents after the block, and None, as a scan needs it.
 
         Args:
-            slots, active: [R] as in `World`, of the vertices in reach.
+            latents: before the block.
+            slots, active: [R] as in `World`, of the R vertices in reach.
         """
         nodes, body, edges, pairs = latents
         here, new_body = self._reached(nodes), body
@@ -113,10 +117,11 @@ def _sum_at(index: Any, rows: Any, count: int, indices_are_sorted: bool = False)
 
 
 class Processor(nn.Module):
-    """Stacks of message-passing blocks. A stack is a scan over parameters with a leading axis.
+    """The step Process of Phi: stacks of message-passing blocks, one after the other, on node latents [V, W].
 
-    In a stack without the fine mesh, only the vertices of its coarse levels exchange messages, with the body too. The
-    others go through the node MLP alone.
+    All blocks of a stack have the same edge sets. They run as a scan, so their parameters have a leading axis of
+    blocks. In a stack without `mesh`, only the vertices of its coarse levels exchange messages, with one another and
+    with the body. The other vertices go through the node MLP alone.
     """
 
     stacks: tuple[Stack, ...]
@@ -166,7 +171,14 @@ class Processor(nn.Module):
 
 
 def reached(stack: Stack, graphs: Graphs, level: np.ndarray) -> tuple[np.ndarray | None, Graphs]:
-    """Find the vertices [R] that have edges in a stack (None for all) and its edge sets, numbered among these."""
+    """Find the R vertices in reach of a stack: those that have edges in it.
+
+    Args:
+        level: [V], as of `Processor`.
+
+    Returns:
+        Their indices [R], None for all vertices; and the edge sets, whose senders and receivers count these vertices.
+    """
     among = {name: graphs[name]._replace(edges=None) for name in stack.edges}
     if stack.lowest_level == 0:
         return None, among
@@ -180,14 +192,20 @@ def reached(stack: Stack, graphs: Graphs, level: np.ndarray) -> tuple[np.ndarray
 
 
 class Encoder(nn.Module):
-    """One MLP for every kind of rows, by its name."""
+    """The step Encode of Phi: an MLP for each kind of rows, from features [N, columns] to latents [N, W].
+
+    A kind is a key of the argument: `nodes`, an edge set such as `mesh`, or `world`.
+    """
 
     width: int
     layers: int
 
     @nn.compact
     def __call__(self, rows: dict[str, Any]) -> dict[str, Any]:
-        """Return latents [N, W] in the place of rows [N, columns]; a kind can have several arrays."""
+        """Return the argument with latents [N, W] in place of rows [N, columns].
+
+        A kind may have several arrays, such as the nodes of garment and body; they go through the same MLP.
+        """
         hidden = (self.width,) * self.layers
         latents = {}
         for name, parts in rows.items():
@@ -197,7 +215,7 @@ class Encoder(nn.Module):
 
 
 class MessagePassing(nn.Module):
-    """Encode and Process (METHOD.md, Phi): from features to the node latents of a garment.
+    """Encode and Process (METHOD.md, Phi): from features to the node latents [V, W] of a garment.
 
     The collection `statistics` has running statistics of the features; `phi.observe` updates them.
     """

@@ -43,7 +43,7 @@ class Dense(nn.Module):
 
 
 def apply(module: nn.Module, params: Params, *arguments: Any, **options: Any) -> Any:
-    """Return what a module with these parameters returns."""
+    """Call a module with given parameters, and return what it returns."""
     return module.apply({"params": params}, *arguments, **options)
 
 
@@ -53,7 +53,7 @@ def init(module: nn.Module, key: Any, *arguments: Any, **options: Any) -> Params
 
 
 class LayerNorm(nn.Module):
-    """A layer that brings rows [N, W] to mean 0 and variance 1, times a scale [W] plus a bias [W]."""
+    """Layer normalisation: each row of [N, W] gets mean 0 and variance 1, then a learned scale [W] and bias [W]."""
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -79,7 +79,7 @@ class MLP(nn.Module):
         return self.tail(self.dense[0](x))
 
     def tail(self, first: Array, in_chunks: bool = False) -> Array:
-        """Return the outputs from the pre-activation [N, W] of the first layer.
+        """Return the outputs [N, outputs], given what the first layer has computed: `first` [N, W], before its ReLU.
 
         Args:
             in_chunks: take some rows at a time, and store nothing but `first` for the backward pass.

@@ -1,4 +1,4 @@
-"""Running statistics of features; scales and bounds of codes and poses."""
+"""Normalisation: running statistics of Phi's features; scales and ranges of Psi's codes and pose inputs."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ class Statistics(NamedTuple):
 
 
 def empty_statistics(columns: int) -> Statistics:
-    """Return statistics of no rows; they leave features as they are."""
+    """Return statistics [columns] before any row: mean 0 and variance 1, which leave features as they are."""
     return Statistics(jnp.zeros(columns), jnp.ones(columns), jnp.zeros(()))
 
 
@@ -66,14 +66,17 @@ class Scale(NamedTuple):
 
 
 class Normalizers(NamedTuple):
-    """Scales of the predictor's inputs and outputs."""
+    """Scales of the latent predictor's codes and pose inputs."""
 
     latent: Scale  # [L]
     pose: Scale  # [P]
 
 
 def identity(size: int) -> Scale:
-    """Return the scale that leaves rows [N] as they are, with a range that holds any."""
+    """Return the scale [size] that changes nothing: mean 0, deviation 1, and a range of +-1e6.
+
+    It takes the place of a measured scale where there is none, as for Psi without stage 1.
+    """
     far = np.full(size, 1e6, np.float32)
     return Scale(np.zeros(size, np.float32), np.ones(size, np.float32), -far, far)
 
@@ -84,24 +87,32 @@ def normalise(scale: Scale, row: Array) -> Array:
 
 
 def denormalise(scale: Scale, row: Array) -> Array:
-    """Invert `normalise`."""
+    """Invert `normalise`: return a row [N] in its own units."""
     return row * scale.deviation + scale.mean
 
 
 def bounded(row: Array, low: Array, high: Array, slack: Array | float = CODE_SLACK) -> tuple[Array, Array]:
-    """Clip a row [N] to [low, high], NaN to the middle; also return whether it was inside but for `slack`."""
+    """Clip a row to a range; NaN becomes the middle of it.
+
+    Args:
+        row, low, high: [N].
+        slack: how far out of the range still counts as inside.
+
+    Returns:
+        The row [N], and a bool: whether all of it was inside.
+    """
     inside = jnp.where(jnp.isnan(row), 0.5 * (low + high), jnp.clip(row, low, high))
     return inside, jnp.all(jnp.abs(inside - row) <= slack)
 
 
 def widened(scale: Scale, rows: np.ndarray) -> Scale:
-    """Return the same scale with its range widened to hold rows [n, N]."""
+    """Return the same scale with its range widened to hold rows [n, N], which are not normalised."""
     rows = np.asarray(normalise(jax.tree.map(np.asarray, scale), rows))
     return scale._replace(low=np.minimum(scale.low, rows.min(0)), high=np.maximum(scale.high, rows.max(0)))
 
 
 def measure(rows: Array) -> Scale:
-    """Measure the scale of rows [n, N]."""
+    """Return mean, deviation and range of the columns of rows [n, N], as a `Scale` in float32."""
     rows = np.asarray(rows, np.float64)
     mean, deviation = rows.mean(0), rows.std(0)
     # a column that never changed in training is left alone, not blown up

@@ -26,13 +26,16 @@ DESCENT_BOUND = 0.3  # of a step of the descent, in Z
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
-    """Return how many vertices the convolution leaves, and channels each; the product L is nearest to config.latent."""
+    """Return the number of vertices that the convolution leaves, and of channels for each.
+
+    Their product is L, the size of the code; the channels are chosen so that it is nearest to `config.latent`.
+    """
     left = scene.tables[-1].ids.shape[0] if scene.tables else scene.garment.vertices.shape[0]
     return left, max(1, round(config.latent / left))
 
 
 class Phi(nn.Module):
-    """Phi of a garment: from features of its state to the latent code of its next frame.
+    """Phi's network for one garment: from features of its state to the code of its next frame.
 
     Variables are `params` and the running `statistics` of the features. Blend shapes and the inverse Hessian are zero
     at first: training measures their initial values.
@@ -57,7 +60,12 @@ class Phi(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Features, guess: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return the next code [L], as a change of a guess [L], and its canonical displacement [V, 3] m."""
+        """Return the next code [L] and its canonical displacement [V, 3] m.
+
+        Args:
+            seen: features of the time step.
+            guess: [L], to which the network's output is added; 0 makes the output the code itself.
+        """
         if self.config.latent_update == "descent":
             self.param("inverse_hessian", nn.initializers.zeros, (self.garment.latent,) * 2)
         latent = guess + self.convolve(self.message_passing(seen))
@@ -77,7 +85,7 @@ def free(scene: Scene) -> Array:
 
 
 def observe(statistics: dict[str, Statistics], seen: Features) -> dict[str, Statistics]:
-    """Return statistics that have also seen features with leading axes [...]; body nodes count as nodes."""
+    """Return running statistics that have also seen features with any leading axes; body nodes count as nodes."""
     return {
         name: normalisation.observe(
             statistics[name], jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
@@ -95,11 +103,14 @@ def step(
     material: MaterialConfig,
     block: type[nn.Module] = message_passing.Block,
 ) -> StepOutput:
-    """Take one step of Phi: return the next positions, their latent code, and the features.
+    """Take one time step by Phi: descent to a guess, then the network (METHOD.md, Phi).
 
     Args:
         model: `params` and `statistics`.
         block: message-passing block, as of `Phi`.
+
+    Returns:
+        Next positions [V, 3] m, their code [L], and the features.
     """
     params = model["params"]
     state, window, potential = inputs.state, inputs.window, inputs.potential
@@ -133,6 +144,10 @@ def step(
 def decode(
     garment: Params, scene: Scene, character: Character, latent: Array, window: Window, config: ModelConfig
 ) -> Array:
-    """Decode a latent code [L] to the next frame's vertices [V, 3] m, by the decoder's parameters."""
+    """Decode a code [L] to the vertices [V, 3] m of the following frame.
+
+    Args:
+        garment: parameters of the decoder with its blend shapes.
+    """
     displaced = mlp.apply(decoder.of(garment, config), garment, latent, free(scene))
     return decoder.vertices(displaced, character.template, window.following.garment)

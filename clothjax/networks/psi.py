@@ -1,4 +1,4 @@
-"""Psi's network (METHOD.md, Psi): the next latent code from the current one and what a game engine knows."""
+"""The latent predictor of Psi (METHOD.md, Psi): the next code from the current one and what a game engine knows."""
 
 import flax.linen as nn
 import jax
@@ -45,7 +45,14 @@ def pose_inputs(rotations: Array, positions: Array, advance: Array, input_joints
 
 
 def window_inputs(poses: Pose, joints: Array, parents: Array, input_joints: np.ndarray, fps: float) -> Array:
-    """Compute `pose_inputs` of a window of three poses, as `motion_clips.poses` gives it."""
+    """Compute `pose_inputs` of a window of poses, as `motion_clips.poses` gives it.
+
+    Args:
+        poses: previous, current and following, leading axis 3.
+        joints: [J, 3] m, of the shaped body in the canonical pose.
+        parents: [J], of the joints.
+        input_joints: [Jk] indices of the joints that are inputs, the root first.
+    """
     advance = jnp.stack([poses.translation[2], -poses.translation[0]])
     rotations = poses.rotations[::-1]
     _, positions = jax.vmap(lambda local: skinning.forward_kinematics(local, joints, parents))(rotations)
@@ -64,23 +71,23 @@ def constant_inputs(betas: Array, material: Material, config: MaterialConfig) ->
 
 
 def bounded_constants(constants: Array, config: Config) -> tuple[Array, Array]:
-    """Clip the constants of `constant_inputs` to the range of training; also return whether they were inside."""
+    """Clip the constants [C] of `constant_inputs` to the range of training; also return whether they were inside it."""
     materials = jnp.ones(len(Material._fields) if config.material.sample else 0)
     betas = jnp.full(len(constants) - len(materials), config.stage1.betas)
     return bounded(constants, jnp.concatenate([-betas, 0 * materials]), jnp.concatenate([betas, materials]))
 
 
 class Psi(nn.Module):
-    """The latent predictor. Its last layer starts small, so that it first keeps the code as it is."""
+    """The latent predictor, an MLP. Its last layer starts small, so that at first the code only decays."""
 
     config: Stage2Config
 
     @nn.compact
     def __call__(self, latent: Array, pose: Array, constants: Array) -> Array:
-        """Return the next code [L] from the current one, normalised pose inputs [P] and constants [C].
+        """Return the next code [L] from the current one [L], pose inputs [P] and constants [C].
 
-        Codes are in standard deviations. A part `latent_decay` of the code decays unless the network restores it, so
-        that no direction of the code drifts.
+        Codes and pose inputs are in standard deviations. A part `latent_decay` of the code decays unless the network
+        restores it, so that no direction of the code drifts.
         """
         inputs = jnp.concatenate([latent, pose, constants])
         layers = MLP((len(inputs), *self.config.hidden, len(latent)), norm=False, last_gain=0.01)
@@ -89,5 +96,9 @@ class Psi(nn.Module):
 
 
 def init(key: Array, latent: int, pose: int, constants: int, config: Stage2Config) -> Params:
-    """Return initial parameters of Psi for sizes of codes L, pose inputs P and constants C."""
+    """Return initial parameters of the latent predictor.
+
+    Args:
+        latent, pose, constants: sizes L, P and C of its inputs.
+    """
     return mlp.init(Psi(config), key, jnp.zeros(latent), jnp.zeros(pose), jnp.zeros(constants))
