@@ -127,7 +127,7 @@ def replicated(device_mesh: Mesh | None) -> NamedSharding | None:
 
 
 def replicate(tree: Tree, device_mesh: Mesh | None) -> Tree:
-    """Copy the arrays of the first process to every device of all processes."""
+    """Copy a pytree of arrays to every device; of several processes, the first one's arrays go to all."""
     if device_mesh is None:
         return jax.tree.map(jnp.asarray, tree)
 

@@ -37,17 +37,25 @@ def settings(config: Config) -> Config:
 
 
 def init(predictor: dict, scene: Scene, clips: Clips, config: Config) -> stage1.TrainingState:
-    """Return the state before the first step."""
+    """Return the state before the first training step of fine-tuning.
+
+    Args:
+        predictor: parameters of the latent predictor after stage 2.
+    """
     key, pool_key = jax.random.split(jax.random.key(config.tuning.seed))
     clips = jax.tree.map(jnp.asarray, clips)
     return stage1.initial_state(jax.tree.map(jnp.array, predictor), {}, key, pool_key, scene, clips, settings(config))
 
 
 def pose_preconditioner(poses: np.ndarray, power: float) -> Array:
-    """Compute the matrix [P, P] for gradients by normalised pose inputs [n, P]: their inverse covariance to a power.
+    """Compute the matrix [P, P] for gradients of Psi's first layer: the inverse covariance of pose inputs, to a power.
 
     The three frames of a window are much alike: velocities and accelerations make up a thousandth or less of the
     variance of the inputs, and are learnt late without this. The matrix preserves the mean square of the inputs.
+
+    Args:
+        poses: [n, P] pose inputs, normalised.
+        power: `tuning.preconditioning`.
     """
     covariance = np.cov(np.asarray(poses, np.float64).T)
     values, vectors = np.linalg.eigh(covariance)
@@ -57,10 +65,11 @@ def pose_preconditioner(poses: np.ndarray, power: float) -> Array:
 
 
 def code_preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: float) -> Array:
-    """Compute the matrix [L, L] for gradients of normalised codes: an inverse Hessian to a power, without its scale.
+    """Compute the matrix [L, L] for gradients of normalised codes: Phi's inverse Hessian to a power, at unit scale.
 
     Args:
         inverse: [L, L] in 1/J, the inverse Hessian of codes that are not normalised.
+        power: `tuning.preconditioning`.
     """
     deviation = np.asarray(normalizers.latent.deviation, np.float64)
     values, vectors = np.linalg.eigh(np.asarray(inverse, np.float64) / np.outer(deviation, deviation))
@@ -71,7 +80,12 @@ def code_preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: fl
 def preconditioners(
     experiment: Experiment, clips: Clips, phi: dict, normalizers: Normalizers, input_joints: np.ndarray
 ) -> Preconditioners | None:
-    """Build both gradient preconditioners from the training poses and Phi's inverse Hessian; None if the power is 0."""
+    """Build the matrices that gradients of fine-tuning are multiplied by; None if `tuning.preconditioning` is 0.
+
+    Args:
+        phi: parameters of Phi, of which the inverse Hessian is used.
+        input_joints: [Jk] indices of the joints that are inputs.
+    """
     config, power = experiment.config, experiment.config.tuning.preconditioning
     if power == 0:
         return None

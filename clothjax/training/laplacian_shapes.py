@@ -1,4 +1,4 @@
-"""Smooth blend shapes, and the network of springs that determines their scale."""
+"""Smooth blend shapes from eigenvectors of a Laplacian, and the springs that set the scale of any blend shapes."""
 
 from typing import NamedTuple
 
@@ -18,21 +18,25 @@ MEMBRANE = 0.25 * energies.THICKNESS  # m, of the springs that model a membrane
 
 
 class Springs(NamedTuple):
-    """The rest shape as a network of springs, for the cost of a displacement along x, y or z."""
+    """A garment at rest as springs along its edges, which tell how much energy a displacement costs.
 
-    free: np.ndarray  # [F] vertices that are not pinned
-    stiffness: scipy.sparse.csc_array  # [F, F] N/m, its Laplacian
-    mass: np.ndarray  # [F] kg
+    The n free vertices move along x, y and z independently and alike. A displacement d [n] m along one of these costs
+    1/2 d^T `matrix` d in J.
+    """
+
+    free: np.ndarray  # [n] indices of the vertices that are not pinned
+    stiffness: scipy.sparse.csc_array  # [n, n] N/m, the weighted Laplacian of the springs
+    mass: np.ndarray  # [n] kg
     timestep: float  # s
 
     @property
     def matrix(self) -> scipy.sparse.csc_array:
-        """Sum of stiffness and inertia, [F, F] N/m."""
+        """Stiffness plus inertia, [n, n] N/m: stiffness + mass / timestep^2."""
         return (self.stiffness + scipy.sparse.diags_array(self.mass / self.timestep**2)).tocsc()
 
 
 def springs(scene: Scene, config: Config) -> Springs:
-    """Build the spring network of the configured cloth."""
+    """Build the springs of a garment of the configured cloth, without bending."""
     cloth, count = config.material, len(scene.garment.vertices)
     edges = topology.edges(np.asarray(scene.garment.faces))
     free = np.flatnonzero(~np.asarray(scene.garment.pinned))
@@ -46,7 +50,7 @@ def springs(scene: Scene, config: Config) -> Springs:
 
 
 def laplacian(scene: Scene, config: Config) -> np.ndarray:
-    """Compute mass-scaled Laplacian eigenvectors, each along x, y and z: [K, V, 3] m.
+    """Compute smooth blend shapes [K, V, 3] m: eigenvectors of the springs' Laplacian, each along x, y and z.
 
     Mode i is divided by sqrt(w_i + 1 / dt^2), so that a unit weight costs about the same energy in every mode. Pinned
     vertices do not move.
@@ -72,6 +76,6 @@ def laplacian(scene: Scene, config: Config) -> np.ndarray:
 
 
 def pad_basis(basis: np.ndarray, count: int) -> np.ndarray:
-    """Pad a basis [K, V, 3] m with zero shapes to `count`."""
+    """Add shapes of zeros to blend shapes [K, V, 3] m until there are `count`."""
     missing = np.zeros((count - len(basis), *basis.shape[1:]))
     return np.concatenate([basis, missing]).astype(np.float32)

@@ -29,14 +29,14 @@ Metrics = dict[str, Any]
 
 
 class Fitted(NamedTuple):
-    """A training so far, or finished."""
+    """The state of a training, and the time that it took so far: what `fit` returns."""
 
     state: Any
     seconds: float  # in calls of `update`, over all sessions, without compilation
     compile_seconds: float  # the first call of each session, until it returned
 
     def after(self, call: Call) -> "Fitted":
-        """Return the training after one more call."""
+        """Return this training after one more call of `update`."""
         return Fitted(call.state, self.seconds + call.seconds, self.compile_seconds + call.compile_seconds)
 
 
@@ -115,7 +115,7 @@ def fit(
 
 
 class Weights(NamedTuple):
-    """The part of a training state that gradient descent changes."""
+    """The part of a training state that gradient descent changes: pytrees of one structure, and the optimiser's."""
 
     params: Any
     average: Any  # exponential moving average of params
@@ -151,10 +151,11 @@ def update_weights(
 def apply_gradient(
     transform: optax.GradientTransformation, state: Any, loss: jax.Array, gradient: Any, ema: float
 ) -> tuple[Any, Metrics]:
-    """Return a training state after `update_weights` of its parameters, one step on, and the metrics.
+    """Take `update_weights` on a training state: return the state one training step on, and the metrics.
 
     Args:
         state: a NamedTuple with the fields `step` and those of `Weights`.
+        loss, gradient, ema: as of `update_weights`.
     """
     weights, metrics = update_weights(
         transform, Weights(state.params, state.average, state.optimizer), loss, gradient, ema
@@ -349,7 +350,7 @@ def _advice(checkpoints: Path) -> Iterator[None]:
 
 
 def _anywhere(flag: int) -> int:
-    """Return the largest of the processes' flags, so that all of them decide alike."""
+    """Return the largest flag that any process of this training gives: all processes then decide alike."""
     if jax.process_count() == 1:
         return flag
     return int(np.max(multihost_utils.process_allgather(np.int32(flag))))

@@ -1,4 +1,4 @@
-"""Loss weights and their ramps: from the terms of the potential to one number."""
+"""The training loss: the energies of a time step, weighted by constants or ramps (METHOD.md, Training)."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,10 @@ from clothjax.types import Array
 
 
 def weighing(config: LossConfig, training_step: Array) -> Callable[[dict[str, Array]], tuple[Array, dict[str, Array]]]:
-    """Return a function from the energies of a step in J to the training loss and the energies in it."""
+    """Return the function that weighs the energies of a time step at a training step.
+
+    It takes the energies in J by name. It returns the loss, and the energies whose weight is not always zero.
+    """
 
     def weigh(terms: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
         present = present_terms(terms, config)
@@ -19,18 +22,18 @@ def weighing(config: LossConfig, training_step: Array) -> Callable[[dict[str, Ar
 
 
 def present_terms(terms: dict[str, Array], config: LossConfig) -> dict[str, Array]:
-    """Return the terms whose weight is not always zero; the others are then not computed."""
+    """Return the energies whose weight is not always zero; a compiled program leaves out what only the others need."""
     return {name: value for name, value in terms.items() if not getattr(config, name).absent}
 
 
 def weighted_loss(terms: dict[str, Array], config: LossConfig, training_step: Array) -> Array:
-    """Compute the training loss: the weighted sum of terms in J over `config.scale`."""
+    """Compute the training loss: the weighted sum of energies in J, divided by `config.scale` J."""
     total = sum(loss_weight(getattr(config, name), training_step) * value for name, value in terms.items())
     return jnp.asarray(total / config.scale)
 
 
 def loss_weight(ramp: Ramp, training_step: Array) -> Array | float:
-    """Return a loss weight at a training step."""
+    """Return the value of a loss weight at a training step: constant, or on its ramp."""
     if ramp.end is None:
         return ramp.start
     progress = (training_step - ramp.first_step) / (ramp.last_step - ramp.first_step)

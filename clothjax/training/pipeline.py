@@ -47,7 +47,7 @@ MAY_DIFFER = {
 
 
 class Run(NamedTuple):
-    """Experiment, folder, clips and devices of a run, for every stage of its training."""
+    """What every stage of a run's training needs: experiment, folder, clips and devices."""
 
     experiment: Experiment
     directory: Path
@@ -65,11 +65,11 @@ class Run(NamedTuple):
 
 
 class Psi(NamedTuple):
-    """A predictor, its scales, and the decoder with blend shapes of its Phi; fine-tuning starts from it."""
+    """The trained parts of Psi from which fine-tuning starts."""
 
-    garment: dict
-    predictor: dict
-    normalizers: Normalizers
+    garment: dict  # parameters of Phi's decoder with its blend shapes, frozen
+    predictor: dict  # parameters of the latent predictor
+    normalizers: Normalizers  # scales of its codes and pose inputs
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
@@ -79,7 +79,15 @@ def run_directory(config: Config, argv: list[str]) -> Path:
 
 
 def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> dict[str, float]:
-    """Train all stages of a run; return the seconds each took, with those of compilation, teacher and start apart."""
+    """Train all stages of a run, or a baseline; return the seconds that its parts took, by name.
+
+    These are `stage1_seconds`, `stage2_seconds`, `tuning_seconds`, `compile_seconds`, `start_seconds` (blend shapes and
+    preconditioner) and `teacher_seconds` (rollouts of Phi).
+
+    Raises:
+        ValueError: as `prepare` and `loop.fit`.
+        FloatingPointError: if training diverges.
+    """
     run = prepare(config, directory, device_mesh)
     if config.peer.network:
         return train_baseline(run)
@@ -134,7 +142,14 @@ def train_phi(run: Run) -> loop.Fitted:
 
 
 def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]]:
-    """Run stage 2: roll Phi out, then train Psi by regression; also return the seconds of all that is not training."""
+    """Run stage 2: roll Phi out, then train Psi by regression.
+
+    Args:
+        phi: stage 1, finished.
+
+    Returns:
+        Stage 2, finished, and the seconds that were not training, by name.
+    """
     scene, config = run.experiment.scene, run.config
     stage, joints = config.stage2, input_joints(run.experiment.names, config.stage2)
     model = {"params": phi.state.average, "statistics": phi.state.statistics}
@@ -155,10 +170,11 @@ def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]
 
 
 def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
-    """Fine-tune Psi on the gradients of the energies.
+    """Run fine-tuning: train Psi on the loss of stage 1, in rollouts of its own.
 
     Args:
-        phi: parameters of Phi, whose preconditioner serves Psi too.
+        phi: parameters of Phi, whose inverse Hessian preconditions Psi's gradients.
+        psi: after stage 2.
     """
     experiment, config = run.experiment, run.config
     progress.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
@@ -172,7 +188,7 @@ def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
 
 
 def train_baseline(run: Run) -> dict[str, float]:
-    """Train a baseline's network on the physics from its first step; its folder is that of Phi, `stage1/`."""
+    """Train a baseline's network on the physics, in the folder of Phi, `stage1/`; return seconds as `train` does."""
     scene, config = run.experiment.scene, run.config
     name, began, new = config.peer.network, time.monotonic(), not run.steps("stage1")
     shapes = _principal_shapes(run) if new and name == "direct" else None

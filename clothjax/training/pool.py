@@ -1,4 +1,4 @@
-"""The pool of persistent simulations that training advances."""
+"""The pool: simulations that training advances in turn and keeps from one training step to the next."""
 
 from typing import NamedTuple
 
@@ -17,17 +17,22 @@ from clothjax.types import Array, ClothState, Material
 
 
 class Simulation(NamedTuple):
-    """One simulation of a character. In the pool every leaf has a leading axis."""
+    """One simulation: a garment on a character at a frame of the clips. In the pool, leaves have a leading axis [N]."""
 
     cloth: ClothState
     betas: Array  # [S]
     material: Material
-    frame: Array  # int32, index into the clips
+    frame: Array  # int32, the current frame, an index into the clips
     fresh: Array  # bool, true before its quasi-static step
 
 
 def dressed(scene: Scene, betas: Array, material: Material, config: Config) -> Character:
-    """Dress the character of a simulation; a shape or material that all simulations share is a constant."""
+    """Build the character of a simulation; a body shape or material that all simulations share becomes a constant.
+
+    Args:
+        betas: [S] of the simulation; not used if `stage1.betas` is 0.
+        material: of the simulation; not used if `material.sample` is false.
+    """
     fixed = config.stage1.betas == 0
     cloth = material if config.material.sample else configured_material(config)
     return characters.dress(scene, None if fixed else betas, cloth, config.physics)

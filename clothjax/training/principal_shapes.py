@@ -30,7 +30,17 @@ def principal(
     progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ) -> np.ndarray:
-    """Compute principal components [K, V, 3] m of `simulate`, with the scale of `laplacian_shapes.laplacian`."""
+    """Compute blend shapes [K, V, 3] m: the principal components of the displacements that `simulate` gives.
+
+    Each is scaled to the energy of a shape of `laplacian_shapes.laplacian`.
+
+    Args:
+        progress: called with the number of simulations done.
+        device_mesh: each device simulates a part of them.
+
+    Raises:
+        ValueError: as `simulate`.
+    """
     frames = simulate(scene, clips, config, progress, device_mesh)
     rows = frames.reshape(-1, frames[0, 0].size).astype(np.float64)
     count = min(config.model.blendshapes, len(rows), rows.shape[1])
@@ -59,6 +69,10 @@ def simulate(
 
     Each step is a few conjugate-gradient steps of all vertices down the potential that trains Phi. Sequences that
     diverged are left out.
+
+    Args:
+        progress: called with the number of sequences done.
+        device_mesh: each device simulates a part of them.
 
     Raises:
         ValueError: for a garment of too many vertices, or if all sequences diverged.

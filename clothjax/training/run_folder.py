@@ -55,7 +55,10 @@ def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, flo
 
 
 def read_seconds(directory: Path) -> tuple[float, float]:
-    """Return seconds and compile seconds of all sessions so far, lost steps included; 0 if unknown."""
+    """Return the seconds of training and of compilation in all sessions so far, from `training.json`; 0 if unknown.
+
+    Steps that were lost, because the process ended before a checkpoint, are counted too.
+    """
     path = directory / "training.json"
     if not path.exists():
         return 0.0, 0.0
@@ -64,13 +67,13 @@ def read_seconds(directory: Path) -> tuple[float, float]:
 
 
 def write_seconds(directory: Path, seconds: float, compile_seconds: float, step: int, steps: int) -> None:
-    """Write the time spent up to `step` of `steps` to `training.json`."""
+    """Write the seconds of training and of compilation up to `step` of `steps` to `training.json`."""
     record = {"step": step, "steps": steps, "seconds": seconds, "compile_seconds": compile_seconds}
     _replace(directory / "training.json", json.dumps(record) + "\n")
 
 
 def add_seconds(directory: Path, **spent: float) -> dict[str, float]:
-    """Add to the seconds in `clock.json` that parts of a run took in all sessions; return the sums."""
+    """Add seconds, by the name of a part of the run, to those in `clock.json`; return the sums of all sessions."""
     path = directory / "clock.json"
     total = json.loads(path.read_text()) if path.exists() else {}
     total |= {name: total.get(name, 0.0) + seconds for name, seconds in spent.items()}

@@ -22,10 +22,12 @@ def sample(
     progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ):
-    """Return `sequence(key, *arguments)` for `count` keys of a seed, stacked, on the host.
+    """Compute `sequence(key, *arguments)` for many random keys; return the results on the host, with an axis [count].
 
     Args:
-        sequence: a function that jax can transform.
+        sequence: a function that jax can transform; it returns a pytree of arrays.
+        arguments: the same for every key.
+        count: number of keys, which come from `seed`.
         progress: called with the number of sequences done.
         device_mesh: each device runs a part of them.
     """

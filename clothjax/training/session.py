@@ -15,18 +15,21 @@ from clothjax import progress
 
 
 class Call(NamedTuple):
-    """A call of an update, which takes some steps."""
+    """What one call of `update` gave; a call takes `steps_per_call` training steps."""
 
-    state: Any
+    state: Any  # after the call
     step: int  # after the call
-    metrics: dict[str, Any]
+    metrics: dict[str, Any]  # arrays [steps_per_call] by name
     seconds: float  # without compilation
-    compile_seconds: float  # zero but for the first
+    compile_seconds: float  # zero but for the first call
 
 
 @contextlib.contextmanager
 def interrupts() -> Iterator[Callable[[], int]]:
-    """Yield a function that returns which of SIGINT and SIGTERM has come, or 0. A second signal acts at once."""
+    """Catch SIGINT and SIGTERM, so that a training can save before it stops; a second signal acts at once.
+
+    It yields a function that returns the number of the signal that has come, or 0.
+    """
     received = []
     before = {}
 

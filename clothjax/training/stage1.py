@@ -34,19 +34,19 @@ MAX_DISTANCE = 5.0  # m from the root, where cloth counts as lost
 
 
 class TrainingState(NamedTuple):
-    """State of stage 1 at a step; resuming from it is exact."""
+    """The state of stage 1, or of another training on the physics, after `step` training steps; resuming is exact."""
 
     step: Array  # int32
-    key: Array
+    key: Array  # of all random numbers to come
     params: dict
-    average: dict  # exponential moving average of the parameters
+    average: dict  # exponential moving average of the parameters, which evaluation uses
     optimizer: optax.OptState
-    statistics: dict
-    pool: Simulation
+    statistics: dict  # of Phi's features, by name; empty for others
+    pool: Simulation  # every leaf with a leading axis
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Build Adam with a clipped norm; its rate is constant, then decays, and is lower for the blend shapes."""
+    """Build Adam on gradients of clipped norm; its rate warms up, stays, then decays, and is lower for blend shapes."""
     stage = config.stage1
     constant_steps = max(1, int(stage.decay_start * stage.steps))
     decay = optax.exponential_decay(
@@ -78,7 +78,7 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 def init(
     scene: Scene, clips: Clips, config: Config, shapes: Array | None = None, block: type[nn.Module] = Block
 ) -> TrainingState:
-    """Return the state before the first step.
+    """Return the state before the first training step of Phi.
 
     Args:
         shapes: [K, V, 3] m, initial blend shapes; smooth ones by default.
@@ -107,7 +107,7 @@ def blank_features(scene: Scene, clips: Clips, config: Config) -> Features:
 
 
 def init_baseline(scene: Scene, clips: Clips, input_joints: np.ndarray, shapes: Array, config: Config) -> TrainingState:
-    """Return the state before the first step of a baseline's network.
+    """Return the state before the first training step of a baseline's network.
 
     Args:
         input_joints: indices of the joints that are inputs.
@@ -124,7 +124,12 @@ def init_baseline(scene: Scene, clips: Clips, input_joints: np.ndarray, shapes: 
 def initial_state(
     params: dict, statistics: dict, key: Array, pool_key: Array, scene: Scene, clips: Clips, config: Config
 ) -> TrainingState:
-    """Return the state before the first step of training these parameters."""
+    """Return the state before the first training step of any network: its parameters, and a new pool.
+
+    Args:
+        params, statistics: of the network.
+        key, pool_key: random keys of the training, and of the pool's first simulations.
+    """
     pool = jax.jit(jax.vmap(lambda k: begin(k, scene, clips, config)))(jax.random.split(pool_key, config.stage1.pool))
     return TrainingState(
         step=jnp.int32(0),
@@ -138,7 +143,7 @@ def initial_state(
 
 
 def preconditioned(state: TrainingState, inverse: Array) -> TrainingState:
-    """Return a state before the first step, with another preconditioner [L, L] of Phi's descent."""
+    """Return the state with another preconditioner of Phi's descent: an inverse Hessian [L, L] in 1/J."""
     return state._replace(
         params=state.params | {"inverse_hessian": jnp.array(inverse)},
         average=state.average | {"inverse_hessian": jnp.array(inverse)},
@@ -146,7 +151,11 @@ def preconditioned(state: TrainingState, inverse: Array) -> TrainingState:
 
 
 def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
-    """Compute the inverse Hessian [L, L] in 1/J of `time_step.rest_energy` over codes near zero."""
+    """Compute the inverse Hessian [L, L] in 1/J, by the code at zero, of the potential at rest (`rest_energy`).
+
+    Args:
+        garment: parameters of the decoder with its blend shapes.
+    """
     energy = time_step.rest_energy(scene, config)
     network = decoder.of(garment, config.model)
 
@@ -159,7 +168,7 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
 
 
 class FirstStep(NamedTuple):
-    """A step of a new simulation, and the features of it."""
+    """The first time step of a new simulation, and Phi's features of it."""
 
     character: Character
     window: Window
@@ -168,7 +177,7 @@ class FirstStep(NamedTuple):
 
 
 def first_step(scene: Scene, simulation: Simulation, clips: Clips, config: Config) -> FirstStep:
-    """Take the first step of a simulation, with the present positions as the guess of the next."""
+    """State the first time step of a simulation, and compute its features with the current positions as the guess."""
     character = dressed(scene, simulation.betas, simulation.material, config)
     window = characters.window(scene, character, motion_clips.poses(clips, simulation.frame))
     step = time_step.time_step(scene, character, simulation.cloth, window, jnp.asarray(1.0 / config.fps), config)
@@ -181,20 +190,20 @@ def first_step(scene: Scene, simulation: Simulation, clips: Clips, config: Confi
 
 
 def rollout_length(step: int, config: Config) -> int:
-    """Return the frames of one rollout at a training step (the curriculum)."""
+    """Return how many frames a training step rolls out (the curriculum)."""
     stage = config.stage1
     return min(max(stage.rollout, stage.rollout_end), stage.rollout + step // stage.rollout_every)
 
 
 class Problem(NamedTuple):
-    """Constants of a training: the same at every step."""
+    """What is the same at every training step."""
 
     scene: Scene
     config: Config
     frames: int  # of a rollout
-    transform: optax.GradientTransformation
-    animator: MakeAnimator
-    device_mesh: Mesh | None
+    transform: optax.GradientTransformation  # the optimiser
+    animator: MakeAnimator  # of the network that is trained
+    device_mesh: Mesh | None  # devices that share a batch; None for one
 
 
 def make_curriculum(
@@ -205,7 +214,10 @@ def make_curriculum(
     device_mesh: Mesh | None = None,
     animator: MakeAnimator = animators.phi_animator,
 ) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """Return `make_update` with rollouts that grow as training proceeds; one compilation for each length."""
+    """Return the function of `make_update`, with rollouts that grow as training proceeds.
+
+    It compiles once for each length, `rollout_length`.
+    """
     updates = {}
 
     def update(state: TrainingState):
@@ -238,7 +250,10 @@ def make_update(
 
 
 def train_step(problem: Problem, clips: Clips, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
-    """Take one step: roll a batch out, descend, then write the simulations back; also return the metrics."""
+    """Take one training step on a batch of B simulations; return the new state and the metrics.
+
+    The batch is rolled out, the gradient changes the parameters, and the simulations go back into the pool.
+    """
     stage = problem.config.stage1
     chosen, simulations = next_batch(state, problem.scene, clips, problem.frames, problem.config)
     rollouts = devices.shard(partial(batch_gradient, problem), problem.device_mesh)
@@ -262,7 +277,11 @@ def train_step(problem: Problem, clips: Clips, state: TrainingState) -> tuple[Tr
 def next_batch(
     state: TrainingState, scene: Scene, clips: Clips, frames: int, config: Config
 ) -> tuple[Array, Simulation]:
-    """Return places [B] in the pool and the simulations [B] there, begun anew if their clip ends or chance has it."""
+    """Take the next B simulations from the pool: return their places [B] in it, and the simulations.
+
+    A simulation starts again if its clip has fewer than `frames` frames left, or at random
+    (`restart_probability`).
+    """
     stage = config.stage1
     begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
     chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
@@ -280,7 +299,10 @@ def next_batch(
 def batch_gradient(
     problem: Problem, simulations: Simulation, params: dict, statistics: dict, step: Array, clips: Clips
 ):
-    """Return what `losses_and_gradient` gives for the rollouts of a device; the gradient has a leading axis of 1."""
+    """Roll out the simulations [N] that one device has, and compute their losses and gradient.
+
+    It returns what `losses_and_gradient` does; the gradient has a leading axis of 1, for the devices.
+    """
     scene, config = problem.scene, problem.config
 
     def loss(params, simulation):
@@ -296,13 +318,25 @@ def batch_gradient(
 
 
 def reset_mask(cloth: ClothState, losses: Array, stage: Stage1Config) -> Array:
-    """Return which simulations [B] are lost: too far away, of too large a loss, or not finite in either."""
+    """Return which simulations are lost: a mask [B].
+
+    Lost is one with a vertex `MAX_DISTANCE` or more from the root, with a loss of `stage.lost` or more, or with either
+    not finite.
+
+    Args:
+        cloth: positions [B, V, 3] m after the rollout.
+        losses: [B].
+    """
     lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < MAX_DISTANCE)
     return lost | ~(losses < (jnp.inf if stage.lost is None else stage.lost))
 
 
 def advance(simulations: Simulation, cloth: ClothState, lost: Array, clips: Clips, frames: int) -> Simulation:
-    """Return the simulations [B] after a rollout; those that are lost go to the end of the clips, to begin anew."""
+    """Return the simulations [B] after a rollout of `frames` frames.
+
+    Lost ones keep their cloth and go to the last frame of the clips, where no frame is left: `next_batch` restarts
+    them.
+    """
     advanced = jnp.where(simulations.fresh, frames - 1, frames)
     frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advanced)
     cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
@@ -310,7 +344,7 @@ def advance(simulations: Simulation, cloth: ClothState, lost: Array, clips: Clip
 
 
 def observe(state: TrainingState, seen: Features, skipped: Array) -> dict:
-    """Return the statistics after a step's features; unchanged if the step was skipped or they are frozen."""
+    """Return the feature statistics after a training step; unchanged if it was skipped, or after `NORMALIZER_STEPS`."""
     return jax.lax.cond(
         skipped | (state.step >= NORMALIZER_STEPS),
         lambda statistics, _: statistics,
@@ -321,10 +355,14 @@ def observe(state: TrainingState, seen: Features, skipped: Array) -> dict:
 
 
 def losses_and_gradient(loss: Callable, params: dict, batch):
-    """Compute the losses [N] of a batch with all else that `loss` returns, and the gradient of their mean.
+    """Compute the losses [N] of a batch, all else that `loss` returns, and the gradient of the mean loss.
 
     On a CPU the elements are taken one after the other: together, contact searches are slower and need N times the
     memory.
+
+    Args:
+        loss: from parameters and one element to its loss, and a pytree.
+        batch: pytree with a leading axis [N].
     """
     single = jax.value_and_grad(loss, has_aux=True)
     count = len(jax.tree.leaves(batch)[0])

@@ -25,20 +25,20 @@ ORDINARY_FRAMES = 10_000  # random frames that show which pose inputs are ordina
 
 
 class Teacher(NamedTuple):
-    """Rollouts of Phi: N sequences of T + 1 codes, and the inputs that lead from each to the next."""
+    """What Psi learns from: N rollouts of Phi, each of T + 1 codes, with the inputs that lead from each to the next."""
 
     latents: Array  # [N, T + 1, L]; the first is zero, as Psi's state is before its first frame
-    poses: Array  # [N, T, P]
-    constants: Array  # [N, C]
+    poses: Array  # [N, T, P] pose inputs
+    constants: Array  # [N, C] betas and material
 
 
 class TrainingState(NamedTuple):
-    """State of stage 2 at a step; resuming from it is exact."""
+    """The state of stage 2 after `step` training steps; resuming from it is exact."""
 
     step: Array  # int32
     key: Array
-    params: dict
-    average: dict
+    params: dict  # of the latent predictor
+    average: dict  # exponential moving average of the parameters, which evaluation uses
     optimizer: optax.OptState
     normalizers: Normalizers
     metric: Array  # [K, K] the mean squared vertex error of blend-weight errors, over the vertices' variance
@@ -73,7 +73,11 @@ def make_rollout(scene: Scene, input_joints: np.ndarray, config: Config) -> Call
 
 
 def blank(model: dict, scene: Scene, clips: Clips, input_joints: np.ndarray, config: Config) -> Teacher:
-    """Return one rollout of NaN: enough of a teacher to read a finished training, and nothing to train on."""
+    """Return a teacher of one rollout, all NaN, for a stage 2 that is finished and is only read.
+
+    It has the shapes that the state of training needs, and spares rolling Phi out. A training step on it would stop at
+    a loss of NaN.
+    """
     shapes = jax.eval_shape(make_rollout(scene, input_joints, config), jax.random.key(0), model, clips)
     return jax.tree.map(lambda part: np.full((1, *part.shape), np.nan, part.dtype), shapes)
 
@@ -87,7 +91,7 @@ def teach(
     progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
 ) -> tuple[Teacher, float]:
-    """Roll Phi out on random clips, bodies and materials; also return the seconds it took.
+    """Roll Phi out on random clips, bodies and materials: return the teacher, and the seconds that it took.
 
     Args:
         model: Phi's `params` and `statistics`.
@@ -109,7 +113,13 @@ def teach(
 
 
 def ordinary_poses(scene: Scene, clips: Clips, input_joints: np.ndarray, config: Config) -> np.ndarray:
-    """Draw inputs [n, P] of random frames and bodies of training; the teacher's few rollouts hold only a part."""
+    """Compute Psi's pose inputs [n, P] at n = `ORDINARY_FRAMES` random frames of the clips, each on a random body.
+
+    They show which inputs are ordinary: the teacher's few rollouts hold only a part of the clips.
+
+    Args:
+        input_joints: [Jk] indices of the joints that are inputs.
+    """
     clips = jax.tree.map(jnp.asarray, clips)
 
     def one(key):
@@ -124,9 +134,10 @@ def ordinary_poses(scene: Scene, clips: Clips, input_joints: np.ndarray, config:
 
 
 def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray | None = None) -> TrainingState:
-    """Return the state before the first step; its normalizers are measured on the teacher's rollouts and `ordinary`.
+    """Return the state before the first training step; normalizers are measured on the teacher and `ordinary`.
 
     Args:
+        garment: parameters of Phi's decoder with its blend shapes.
         ordinary: more inputs [n, P], such as those of `ordinary_poses`.
     """
     key, model_key = jax.random.split(jax.random.key(config.stage2.seed))
@@ -151,7 +162,7 @@ def init(teacher: Teacher, garment: dict, config: Config, ordinary: np.ndarray |
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Build Adam with a clipped norm and a cosine-decayed rate."""
+    """Build Adam on gradients of clipped norm, with a rate that decays as a cosine."""
     stage = config.stage2
     return optax.chain(
         optax.clip_by_global_norm(stage.clip),
@@ -160,9 +171,12 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def vertex_metric(garment: dict, latents: Array, model: ModelConfig) -> Array:
-    """Compute the matrix M [K, K]: w^T M w is the mean squared displacement of vertices, as a share of its variance.
+    """Compute the matrix M [K, K] that measures an error w [K] of blend weights by the vertices it moves.
+
+    w^T M w is the mean squared displacement of vertices, over their variance (METHOD.md, Training: Q).
 
     Args:
+        garment: parameters of the decoder with its blend shapes.
         latents: [N, L] codes over which the variance is taken.
     """
     weights = jax.vmap(_weights(garment, model))(jnp.asarray(latents))
@@ -194,7 +208,10 @@ def rollout_loss(
     Args:
         params: of the predictor.
         state: for its normalizers, metric and decoder.
-        latents: [H + 1, L] teacher codes; poses: [H, P]; constants: [C]; key: of the noise.
+        latents: [n + 1, L], codes of the teacher, n being `stage2.rollout`.
+        poses: [n, P], pose inputs, not normalised.
+        constants: [C].
+        key: of the noise.
     """
     stage, normalizers = config.stage2, state.normalizers
     targets = jax.vmap(lambda z: normalisation.normalise(normalizers.latent, z))(latents)
