@@ -11,23 +11,23 @@ from clothjax.types import Array, Motion, Pose
 
 
 class Clips(NamedTuple):
-    """Clips of N frames in all. Only steps of the root are stored: the scene has no place in the world."""
+    """Clips laid end to end, N frames in all. Of the root only steps are stored: a scene has no place in the world."""
 
-    rotations: Array  # [N, J, 3, 3]
+    rotations: Array  # [N, J, 3, 3] local to the parent
     advance: Array  # [N, 3] m, translation of the next frame minus this one's; zero at a clip's end
-    remaining: Array  # [N] int32, steps from a frame on before an unusable one
-    passed: Array  # [N] int32, the same backwards
+    remaining: Array  # [N] int32, how many frames in a row, from this one on, have a usable window
+    passed: Array  # [N] int32, the same backwards, up to this one
     chance: Array  # [N] cumulative probability of starting at a frame
 
 
 def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequence[np.ndarray], shortest: int) -> Clips:
-    """Lay clips end to end, with the chance of starting at each frame.
+    """Lay motions end to end, and compute at which frames a simulation may start and how likely.
 
     Args:
         motions: with the same joints and rate.
         families: one name a motion; every family gets equally many starts, however long its clips are.
-        bad: frames of each motion that must not be in any window.
-        shortest: steps that must remain at a start.
+        bad: for each motion the indices of frames that no window may contain.
+        shortest: frames with a usable window that must follow in a row, the start included.
 
     Raises:
         ValueError: if no frame can be a start.
@@ -71,20 +71,34 @@ def concatenate(motions: Sequence[Motion], families: Sequence[str], bad: Sequenc
 
 
 def draw(clips: Clips, uniform: Array) -> Array:
-    """Return the start frame that a number in [0, 1) draws."""
+    """Return the start frame (int32, of N) that a uniform random number in [0, 1) selects by `clips.chance`."""
     last = clips.chance.shape[0] - 1
     return jnp.minimum(jnp.searchsorted(clips.chance, uniform, side="right"), last).astype(jnp.int32)
 
 
 def poses(clips: Clips, frame: Array | int) -> Pose:
-    """Previous, current and following pose of a frame (leading axis 3); translations relative to the current one."""
+    """Return the window of a frame: the previous, the current and the following pose.
+
+    Args:
+        frame: of the N in `clips`.
+
+    Returns:
+        Local rotations [3, J, 3, 3], and translations [3, 3] m relative to that of the current frame.
+    """
     before = clips.advance[frame - 1]
     translation = jnp.stack([-before, jnp.zeros_like(before), clips.advance[frame]])
     return Pose(clips.rotations[frame + jnp.arange(-1, 2)], translation)
 
 
 def there_and_back(clips: Clips, frame: Array | int, count: int) -> Pose:
-    """Return windows [count, 3, ...] like those of `poses`, from a frame on; a clip that ends sooner turns back."""
+    """Return the windows of `count` frames in a row, from a frame on; where its clip ends, the motion runs backwards.
+
+    Args:
+        frame: of the N in `clips`, the first of them.
+
+    Returns:
+        Rotations [count, 3, J, 3, 3] and translations [count, 3, 3] m, each window as `poses` gives it.
+    """
     # from the frame before the first that has a window to the one after the last
     first, period = frame - clips.passed[frame], clips.passed[frame] + clips.remaining[frame]
     along = jnp.abs((frame - first + jnp.arange(-1, count + 1)) % (2 * period) - period)
@@ -105,5 +119,5 @@ def _advance(clips: Clips, start: Array, end: Array) -> Array:
 
 
 def standing(poses: Pose) -> Pose:
-    """Repeat the current pose of a window three times: the body holds still."""
+    """Return a window (leading axis 3) that has the current pose of another three times: a body that holds still."""
     return Pose(jnp.broadcast_to(poses.rotations[1:2], poses.rotations.shape), jnp.zeros_like(poses.translation))

@@ -31,7 +31,7 @@ MIN_TURN_RATE = 1.0  # rad/s, the limit of a joint that hardly turns in the clip
 
 
 class Library(NamedTuple):
-    """The frames of all clips, one after the other, relative to the character's place on the ground and heading."""
+    """The N frames of all clips in a row, relative to the character's place on the ground and its heading."""
 
     rotations: np.ndarray  # [N, J, 3, 3] local; the root's without the heading
     root: np.ndarray  # [N, 3] m, place of the root joint
@@ -181,10 +181,10 @@ def _apply(vectors: np.ndarray, matrices: np.ndarray) -> np.ndarray:
 
 
 class Player:
-    """A character that a player steers.
+    """A character that a player steers: each `step` gives the pose of its next frame.
 
     Args:
-        clips: the source of its motion.
+        clips: the library from which its motion is taken.
         wander: the families in which it moves when no other is requested; default all.
     """
 

@@ -28,12 +28,12 @@ def from_axis_angle(vector: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def to_6d(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 6"]:
-    """Return the first two columns of rotation matrices [..., 3, 3] as [..., 6]; Zhou et al. 2019."""
+    """Return the 6D representation [..., 6] of rotation matrices [..., 3, 3]: two columns (Zhou et al. 2019)."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 
 def from_6d(code: Float[Array, "*n 6"], epsilon: float = 1e-12) -> Float[Array, "*n 3 3"]:
-    """Rotation matrices [..., 3, 3] from 6-D codes [..., 6] by Gram-Schmidt; finite for any input."""
+    """Rotation matrices [..., 3, 3] from the 6D representation [..., 6] of `to_6d`, by Gram-Schmidt; always finite."""
     first, second = code[..., :3], code[..., 3:]
     x = _unit(first, epsilon)
     y = _unit(second - jnp.sum(x * second, axis=-1, keepdims=True) * x, epsilon)

@@ -55,7 +55,13 @@ def joint_transforms(
 def bound_transforms(
     rotation: Float[Array, "J 3 3"], position: Float[Array, "J 3"], joints: Float[Array, "J 3"]
 ) -> Float[Array, "J 3 4"]:
-    """`joint_transforms` from global rotations R [J, 3, 3], positions q [J, 3] m and canonical joints J [J, 3] m."""
+    """Return the transforms [J, 3, 4] of `joint_transforms` where the forward kinematics are known.
+
+    Args:
+        rotation: [J, 3, 3] global.
+        position: [J, 3] m of the posed joints.
+        joints: [J, 3] m of the canonical joints.
+    """
     offset = position - jnp.einsum("jab,jb->ja", rotation, joints, precision=HIGHEST)
     return jnp.concatenate([rotation, offset[:, :, None]], axis=-1)
 

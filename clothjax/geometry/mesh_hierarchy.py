@@ -17,7 +17,7 @@ Neighbours = list[list[int]]
 
 
 class Level(NamedTuple):
-    """One level of a mesh-convolution hierarchy: P sampled vertices of N, each reading those around it."""
+    """The table of one mesh-convolution block: P of N vertices are kept, and each reads K places around it."""
 
     sampled: np.ndarray  # [P] int32, ascending indices into the N vertices
     ids: np.ndarray  # [P, K] int32 of the N vertices, the sampled one first, then ring by ring; padded with N

@@ -1,4 +1,4 @@
-"""Searches for the nearest point of a cloud, triangle of a mesh and point of a triangle."""
+"""Nearest points of a cloud, nearest triangles of a mesh, nearest points of a triangle, and winding numbers."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ LAST = jnp.iinfo(jnp.int32).max
 
 
 class Patches(NamedTuple):
-    """The triangles of a mesh, and small groups of neighbours among them."""
+    """A triangle mesh prepared for searches: its F triangles are divided into G groups of neighbours, the patches."""
 
     faces: Array  # [F, 3] int32
     across: Array  # [F, 3] int32, the face across the edge opposite a corner; itself where there is none
@@ -30,7 +30,10 @@ class Patches(NamedTuple):
 
 
 def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
-    """Divide a mesh [B, 3] m into patches, halved along the longest side of their box until small enough."""
+    """Prepare a mesh of vertices [B, 3] m and faces [F, 3] for searches.
+
+    The triangles are halved along the longest side of their box until a group has at most `PATCH`.
+    """
     faces = np.asarray(faces)
     # half-edges (a, b) and (b, a) meet
     start, end = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)

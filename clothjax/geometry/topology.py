@@ -38,7 +38,10 @@ def edges(faces: np.ndarray) -> np.ndarray:
 
 
 def directed(undirected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return senders and receivers [2 E] int32 of both directions of edges [E, 2], sorted by receiver, then sender."""
+    """Return both directions of undirected edges [E, 2] as senders and receivers, each [2 E] int32.
+
+    They are sorted by receiver, then by sender.
+    """
     undirected = np.asarray(undirected, np.int32).reshape(-1, 2)
     both = np.concatenate([undirected, undirected[:, ::-1]])
     both = both[np.lexsort((both[:, 0], both[:, 1]))]

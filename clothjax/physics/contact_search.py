@@ -28,7 +28,7 @@ def find(
     patches: Patches,
     ahead: Float[Array, "V 3"] | None = None,
 ) -> Contact:
-    """Find the contact planes of positions [V, 3] m: through the nearest point of the body, normal to the offset.
+    """Find one contact plane for each position [V, 3] m: through the nearest point of the body, normal to the offset.
 
     The distance to a plane is the signed distance to the body, with the sign from pseudonormals (Baerentzen & Aanaes
     2005). In bent hips and knees, skinning turns skin inside out and pushes it through to the other side. Pseudonormals
@@ -43,6 +43,7 @@ def find(
     Args:
         body: [B, 3] m at this frame.
         body_next: [B, 3] m at the next frame.
+        patches: the faces of the body, of `proximity.patches`.
         ahead: [V, 3] m, expected positions at the next frame; None lets every plane move along.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))

@@ -1,4 +1,4 @@
-"""Preconditioned nonlinear conjugate gradients, for any energy of any coordinates."""
+"""Descent of the potential by preconditioned nonlinear conjugate gradients (METHOD.md, Descent)."""
 
 from collections.abc import Callable
 
@@ -62,17 +62,21 @@ def descend(
 def warm_start(
     latent: Array, change: Array, garment: Callable[[Array], Array], potential: Callable[[Array], Array]
 ) -> Array:
-    """Return the first code [L] for `descend`: the last one, plus its last change if the potential is lower there.
+    """Return the code [L] from which `descend` starts: the current one, plus its last change if the potential falls.
 
-    From the last code alone, the error that a few steps leave acts like a drag on the cloth. The sum is far off where
-    the motion changes abruptly.
+    From the current code alone, the error that a few steps leave acts like a drag on the cloth. The sum is far off
+    where the motion changes abruptly.
+
+    Args:
+        latent, change: [L], the current code and its change in the last frame.
+        garment, potential: as of `descend`.
     """
     here, there = latent, latent + change
     return jnp.where(potential(garment(there)) < potential(garment(here)), there, here)
 
 
 def hessian(energy: Callable[[Array], Array], latent: Array) -> Array:
-    """Return the Hessian [L, L] in J of an energy of codes, at a code [L]."""
+    """Return the Hessian [L, L] in J of an energy, a function from a code to J, at a code [L]."""
 
     def column(direction):
         return jax.jvp(jax.grad(energy), (latent,), (direction,))[1]
@@ -82,7 +86,7 @@ def hessian(energy: Callable[[Array], Array], latent: Array) -> Array:
 
 
 def nearest_convex(matrix: Array) -> Array:
-    """Clamp the negative eigenvalues of a symmetric matrix [L, L] to zero."""
+    """Return a symmetric matrix [L, L] with its negative eigenvalues set to zero."""
     values, vectors = jnp.linalg.eigh(matrix)
     return jnp.matmul(vectors * jnp.maximum(values, 0.0)[None], vectors.T, precision="highest")
 

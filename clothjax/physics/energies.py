@@ -53,12 +53,19 @@ def vertex_areas(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"]) -> Flo
 def regional(
     rest: Rest, areas: Float[Array, " V"], mesh: Mesh, cloth: Float[Array, "V 3"]
 ) -> tuple[Rest, Float[Array, " V"]]:
-    """Scale rest measures and areas [V] m^2 by the factors of cloth that is not the same everywhere.
+    """Apply the factors of cloth that is not the same everywhere to a garment's rest measures and vertex areas.
 
-    The measures of an element weigh its energy, so scaling them scales the material there.
+    A face's energy is proportional to its rest area, a hinge's to the inverse of its own, a mass to the vertex area.
+    Scaling these areas therefore scales the material there.
 
     Args:
-        cloth: [V, 3] factors of density, of mu and lam, and of bending; elements take the mean of their corners.
+        rest: of the uniform cloth.
+        areas: [V] m^2, of its vertices.
+        mesh: faces and hinges; each takes the mean factor of its corners.
+        cloth: [V, 3] factors of density, of mu and lam, and of bending.
+
+    Returns:
+        The rest measures, and the areas [V] m^2 that give the masses.
     """
     _, stretching, bending = cloth.T
     return rest._replace(
@@ -68,7 +75,7 @@ def regional(
 
 
 def green_strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> Float[Array, "F 2 2"]:
-    """Green strain [F, 2, 2] of posed triangles [F, 3, 3] m with inverse rest edge matrices [F, 2, 2]."""
+    """Green strain [F, 2, 2] of deformed triangles [F, 3, 3] m with inverse rest edge matrices [F, 2, 2] 1/m."""
     edges = jnp.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=-1)
     gradient = jnp.einsum("fab,fbc->fac", edges, inverse)
     metric = jnp.einsum("fab,fac->fbc", gradient, gradient)
@@ -133,7 +140,7 @@ def inertia(
 
 
 def collision(distance: Float[Array, "*n"], offset: float = COLLISION_OFFSET) -> Float[Array, "*n"]:
-    """Cubic penetration max(offset - d, 0)^3 [V] m^3 at signed distances [V] m; times a stiffness, J/m^3."""
+    """Cubic penetration max(offset - d, 0)^3 [V] m^3 at signed distances d [V] m; a stiffness in J/m^3 makes it J."""
     depth = jnp.maximum(offset - distance, 0.0)
     return depth * depth * depth
 

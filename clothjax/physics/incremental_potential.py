@@ -1,4 +1,4 @@
-"""The incremental potential of one time step (METHOD.md, Incremental potential): its terms, and their weighted sum."""
+"""The incremental potential of one time step (METHOD.md, Incremental potential): its energies, and their plain sum."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +16,7 @@ FRICTION_SMOOTHING = 1e-4  # m
 
 
 class TimeStep(NamedTuple):
-    """Everything that the incremental potential of a step depends on, except the new positions."""
+    """Everything that the incremental potential of a time step depends on, except the new positions."""
 
     position: Array  # [V, 3] m, at the current frame
     velocity: Array  # [V, 3] m per step, so that position + velocity is the inertial prediction
@@ -41,7 +41,7 @@ LAWS = Laws()
 
 
 def touching(position: Float[Array, "V 3"], contact: Contact) -> Bool[Array, " V"]:
-    """Return a mask [V] of the vertices [V, 3] m within `FRICTION_RADIUS` of their contact planes."""
+    """Return which vertices [V, 3] m are less than `FRICTION_RADIUS` from their contact planes: a mask [V]."""
     return contact_search.distance(position, contact.point, contact.normal) < FRICTION_RADIUS
 
 
@@ -88,7 +88,7 @@ def elements(
 def edge_collision(
     ends: Float[Array, "*n 2 3"], contact: EdgeContact, config: PhysicsConfig, laws: Laws = LAWS
 ) -> Float[Array, "*n"]:
-    """Collision energy [...] J of edges [..., 2, 3] m at the places that may touch the body."""
+    """Collision energy [...] J of edges [..., 2, 3] m with the planes at their places of `contact`."""
     start, end = ends[..., 0, :], ends[..., 1, :]
     # differences first: far from the origin the place itself is coarse
     offset = (start - contact.point_next) + contact.place[..., None] * (end - start)
@@ -99,7 +99,11 @@ def edge_collision(
 def self_collision(
     points: Float[Array, "*n 4 3"], contact: SelfContact, config: PhysicsConfig, laws: Laws = LAWS
 ) -> Float[Array, "*n"]:
-    """Collision energy [...] J of vertices and the triangles they may touch: vertex, then corners [..., 4, 3] m."""
+    """Collision energy [...] J of garment vertices with garment triangles.
+
+    Args:
+        points: [..., 4, 3] m, a vertex and then the three corners of the triangle that it may touch.
+    """
     offset = jnp.sum(contact.weights[..., :, None] * (points[..., :1, :] - points[..., 1:, :]), axis=-2)
     distance = jnp.sum(offset * contact.normal, axis=-1)
     return config.collision_stiffness * laws.collision(distance, config.self_offset)

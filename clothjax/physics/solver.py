@@ -27,16 +27,20 @@ TOLERANCE = 1e-6  # remaining force over the weight
 
 
 class Structure(NamedTuple):
-    """The pattern of the Hessian in 3 x 3 blocks (block sparse rows), and the element blocks that each sums."""
+    """The sparsity pattern of the potential's Hessian: N blocks of 3 x 3, for pairs of vertices (block sparse rows).
 
-    indptr: np.ndarray  # [V + 1] int32
+    Each pair of corners of each element (face, hinge, vertex, edge) has a block of its own, P in all. `gather` sums
+    those of one pair of vertices.
+    """
+
+    indptr: np.ndarray  # [V + 1] int32, where the blocks of each vertex's row begin
     indices: np.ndarray  # [N] int32, column of each block
     diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
-    gather: scipy.sparse.csr_array  # [N, P] ones, where block n sums the block of a pair of an element's corners
+    gather: scipy.sparse.csr_array  # [N, P], one where block n sums the block of an element's pair of corners
 
 
 class SolverInfo(NamedTuple):
-    """The outcome of a solve."""
+    """The outcome of solving one time step."""
 
     converged: bool
     iterations: int
@@ -156,10 +160,18 @@ def _present(step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> tuple[TimeSte
 def hessians(
     x: Array, step: TimeStep, mesh: Mesh, pattern: Structure, config: PhysicsConfig, laws: Laws = LAWS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks [N, 3, 3] N/m of the exact Hessian of the potential at [V, 3] m, and of a semidefinite one.
+    """Evaluate the Hessian of the potential: the exact one, and a positive semidefinite approximation of it.
 
-    The second clamps the stress of stretching to tension (principal values >= 0). It takes the square of the
-    residual's gradient for bending (Gauss-Newton), and the positive eigenvalues for terms of single vertices.
+    The approximation preconditions the solve with the exact one. It clamps the stress of stretching to tension
+    (principal values >= 0). It takes the square of the residual's gradient for bending (Gauss-Newton), and the positive
+    eigenvalues for terms of single vertices.
+
+    Args:
+        x: [V, 3] m, the positions.
+        pattern: of `structure`, for the same step and mesh.
+
+    Returns:
+        The blocks [N, 3, 3] N/m of both, in the order of `pattern`.
     """
     exact, semidefinite = (
         (pattern.gather @ np.asarray(blocks).reshape(-1, 9)).reshape(-1, 3, 3)

@@ -1,4 +1,4 @@
-"""The fixed parts of an experiment, assembled from its configuration: files, scene, clips, character."""
+"""From a configuration to loaded data: body and garment, the scene, motion clips, characters."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ MEASURABLE = 12  # least number of frames that all measures need
 
 
 class Experiment(NamedTuple):
-    """The loaded parts that a configuration names."""
+    """A configuration with the body, the garment and the scene that it names."""
 
     config: Config
     names: tuple[str, ...]  # of the joints
@@ -37,7 +37,7 @@ def assemble(config: Config) -> Experiment:
 
 
 def dress(experiment: Experiment, betas: Array | np.ndarray, material: Material) -> Character:
-    """Build a character of shape `betas` [S] in cloth of `material`, compiled with the scene as a constant."""
+    """Build the character of shape `betas` [S] in cloth of `material`, by one compiled program."""
     dressed = jax.jit(lambda b, m: characters.dress(experiment.scene, b, m, experiment.config.physics))
     return dressed(jnp.asarray(betas), material)
 
@@ -110,7 +110,7 @@ def evaluation_motion(experiment: Experiment, name: str | Path) -> Motion:
 
 
 def windows(clip: Motion) -> Clips:
-    """Return the clips of one motion, with every frame usable."""
+    """Return one motion as `Clips`, in which every frame but the first and the last has a window."""
     return motion_clips.concatenate([clip], [""], [np.zeros(0, int)], 1)
 
 

@@ -14,11 +14,11 @@ from clothjax.types import Array, Material, Pose, Rest
 
 
 class Character(NamedTuple):
-    """The part of a simulation that depends on betas and material."""
+    """One body shape in cloth of one material: what depends on betas and material, but on no pose."""
 
     template: Array  # [V, 3] m, the shaped garment in the canonical pose
-    body: Array  # [B, 3] m, the shaped body within reach
-    joints: Array  # [J, 3] m
+    body: Array  # [B, 3] m, the shaped body within reach, in the canonical pose
+    joints: Array  # [J, 3] m, of the shaped body in the canonical pose
     rest: Rest
     mass: Array  # [V] kg
     material: Material
@@ -26,13 +26,13 @@ class Character(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A character at one frame. Positions are relative to the root's translation at the current frame."""
+    """A character at one frame of a window. Positions are relative to the root's translation at the current frame."""
 
     garment: Array  # [V, 3, 4] skinning transforms of the garment's vertices
     body: Array  # [B, 3] m
-    normals: Array  # [B, 3]
-    root: Array  # [3] m, the root joint
-    heading: Array  # [3, 3] of the root, about +Y
+    normals: Array  # [B, 3] unit normals of the body's vertices
+    root: Array  # [3] m, place of the root joint
+    heading: Array  # [3, 3] rotation about +Y, from ahead to where the root faces
 
 
 class Window(NamedTuple):
@@ -44,9 +44,12 @@ class Window(NamedTuple):
 
 
 def dress(scene: Scene, betas: Array | None, material: Material, config: PhysicsConfig) -> Character:
-    """Build the character of shape `betas` [S] in cloth of `material`; without betas, the shape is the modelled one.
+    """Build a character: the template of its garment, rest measures, masses, and its shaped body.
 
-    The modelled shape is measured once, when a program is compiled.
+    Args:
+        betas: [S] body shape, in standard deviations. None is the shape as modelled, for programs in which all
+            characters have it: its measures are then constants of the compiled program.
+        material: scalars; they may be traced.
     """
     if betas is None:
         betas = jnp.zeros(scene.body.shapedirs.shape[-1])
@@ -78,7 +81,11 @@ def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Ar
 
 
 def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
-    """Return the character at a pose whose translation [3] m is relative to the root's at the current frame."""
+    """Return the character at a pose: its posed body, and the skinning transforms of its garment.
+
+    Args:
+        pose: its translation [3] m is relative to the root's at the current frame.
+    """
     transforms = jnp.asarray(skinning.joint_transforms(pose.rotations, character.joints, scene.body.parents))
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
     body = skinning.apply(
@@ -97,7 +104,11 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
 
 
 def window(scene: Scene, character: Character, poses: Pose) -> Window:
-    """Return three frames from `poses` (leading axis 3), with translations [3, 3] m relative to the middle one's."""
+    """Return the character at the three poses of a window.
+
+    Args:
+        poses: leading axis 3, as of `motion_clips.poses`; translations [3, 3] m are relative to the middle one's.
+    """
     if scene.still:
         now = frame(scene, character, jax.tree.map(lambda x: x[1], poses))
         return Window(now, now, now)
@@ -110,5 +121,5 @@ def window(scene: Scene, character: Character, poses: Pose) -> Window:
 
 
 def skinned(character: Character, frame: Frame) -> Array:
-    """Return the garment [V, 3] m by skinning alone."""
+    """Return the garment [V, 3] m at a frame by plain skinning, without any displacement."""
     return skinning.apply(frame.garment, character.template)

@@ -28,10 +28,10 @@ class Problem(NamedTuple):
 
 
 def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, Pose], Problem]:
-    """Return a jitted function that states a time step.
+    """Return a jitted function from a garment's last two frames to the `Problem` that the solver then solves.
 
-    Its arguments are the character, the garment [V, 3] m at the last frame and at this one, each relative to its
-    root, and the three poses around the step.
+    Its arguments are the character, the garment [V, 3] m at the previous and at the current frame, and the window of
+    poses (leading axis 3). Each garment is relative to the root of its own frame.
     """
 
     @jax.jit
@@ -58,7 +58,7 @@ def simulate(
     max_iterations: int = 500,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[np.ndarray, list[SolverInfo]]:
-    """Solve a motion frame by frame.
+    """Simulate a garment over a motion with the reference solver, frame by frame.
 
     If the solve of a frame does not converge, its `SolverInfo` says so, and the next frame continues from its result.
 

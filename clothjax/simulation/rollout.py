@@ -1,4 +1,4 @@
-"""Steps of a garment by an animator, and rollouts: scans over frames that accumulate the losses."""
+"""Time steps of a garment by an animator, and rollouts of many, with the losses of training."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,25 +19,25 @@ from clothjax.types import Array, ClothState, Pose, Scalar
 
 
 class StepInput(NamedTuple):
-    """The inputs from which an animator moves a garment by one frame."""
+    """The inputs of an animator for one time step."""
 
     state: ClothState
-    poses: Pose  # three poses, leading axis 3
+    poses: Pose  # previous, current and following, leading axis 3
     window: Window  # the character at these poses
     time_step: TimeStep
     potential: Callable[[Array], Array]  # of next positions [V, 3] m, in J
 
 
 class StepOutput(NamedTuple):
-    """The outputs of an animator for one frame."""
+    """The outputs of an animator for one time step."""
 
     position: Array  # [V, 3] m, relative to the root at the current frame
-    code: Array  # [L] memory that the animator carries to the next frame
-    seen: Any = None  # pytree of features for its running statistics
+    code: Array  # [L] code or memory that the animator carries to the next frame
+    seen: Any = None  # pytree of features, for Phi's running statistics
 
 
 class Animator(NamedTuple):
-    """A method that moves one character's garment: a network, or the physics itself."""
+    """What moves one character's garment, a time step at a time: a network, or the physics itself."""
 
     memory_size: int  # L, numbers carried from frame to frame
     step: Callable[[StepInput], StepOutput]
@@ -45,7 +45,7 @@ class Animator(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A step that was taken, and the constants of its potential."""
+    """A time step that was taken, and the constants of its potential."""
 
     position: Array  # [V, 3] m, relative to the root at the current frame
     time_step: TimeStep
@@ -53,7 +53,7 @@ class Taken(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A rollout of T frames."""
+    """What `play` records of a rollout of T frames."""
 
     position: Array  # [T, V, 3] m after each step, relative to the root before it
     states: ClothState  # before each step, every leaf with a leading axis T
@@ -69,7 +69,12 @@ def take(
     timestep: Scalar,
     config: Config,
 ) -> tuple[ClothState, Taken]:
-    """Take one frame of `timestep` s; the returned state is still relative to the current root."""
+    """Take one time step; the returned state is still relative to the root at the current frame.
+
+    Args:
+        poses: window, leading axis 3.
+        timestep: s, the duration.
+    """
     window = characters.window(scene, character, poses)
     step = time_step(scene, character, state, window, timestep, config)
 
@@ -90,7 +95,7 @@ def follow(state: ClothState, advance: Array) -> ClothState:
 def advance(
     animator: Animator, scene: Scene, character: Character, state: ClothState, poses: Pose, config: Config
 ) -> tuple[ClothState, Array]:
-    """Take one frame of a motion.
+    """Take one time step of 1 / fps s along a motion.
 
     Returns:
         The state, relative to the root of the next frame, and the positions [V, 3] m, relative to the current root.

@@ -1,4 +1,4 @@
-"""The fixed part of an experiment: garment, the body within its reach, graphs and tables. NumPy only."""
+"""The scene: a garment, the part of the body within its reach, graphs and tables. NumPy only."""
 
 from typing import NamedTuple
 
@@ -16,14 +16,14 @@ NEAR_SHARE = 0.05  # share of a joint's vertices beside the garment from which t
 
 
 class Table(NamedTuple):
-    """One mesh-convolution block's neighbours: output p reads inputs ids[p, k] where mask[p, k]."""
+    """The neighbours that a mesh-convolution block reads: output p reads the inputs ids[p, k] where mask[p, k]."""
 
-    ids: Array  # [P, N] int32, padded with the number of inputs
-    mask: Array  # [P, N] bool
+    ids: Array  # [P, K] int32, padded with the number of inputs
+    mask: Array  # [P, K] bool
 
 
 class Scene(NamedTuple):
-    """The fixed part of a simulation."""
+    """What all simulations of an experiment share, whatever their character and motion."""
 
     garment: Garment
     body: Body  # only the vertices that the garment can reach; none where there is no body to touch
@@ -31,7 +31,7 @@ class Scene(NamedTuple):
     mesh: Mesh  # elements that have energy: faces, hinges and edges with a vertex that is not pinned
     graph: dict[str, jraph.GraphsTuple]  # `mesh`, and the coarse levels in use: edges sorted by receiver
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
-    tables: tuple[Table, ...]
+    tables: tuple[Table, ...]  # one a block of mesh convolution
     patches: Patches | None  # of the body
     garment_patches: Patches
 
@@ -42,7 +42,11 @@ class Scene(NamedTuple):
 
 
 def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
-    """Build the scene of a garment on a body; deterministic."""
+    """Build the scene of a garment on a body; deterministic.
+
+    Raises:
+        ValueError: if the body is not near the garment, or a coarse level of `model.processor` would be empty.
+    """
     faces = np.asarray(garment.faces)
     used = {name for stack in config.model.processor for name in stack.edges}
     depth = 1 + max((int(name.removeprefix("coarse")) for name in used if name != "mesh"), default=-1)
@@ -79,7 +83,10 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:
-    """Build a graph without features from undirected edges [E, 2]: both directions, sorted by receiver."""
+    """Build a graph without features from undirected edges [E, 2] of V `vertices`.
+
+    It has both directions, 2 E edges sorted by receiver.
+    """
     senders, receivers = topology.directed(undirected)
     counts = (np.array([n], np.int32) for n in (vertices, len(senders)))
     # jraph's annotations name JAX arrays only

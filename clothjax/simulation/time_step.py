@@ -1,4 +1,4 @@
-"""Statement of one time step: contact planes, masses, the potential to minimise."""
+"""What one time step starts from: a garment as skinned, and the constants of the incremental potential."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,11 @@ from clothjax.types import Array, ClothState, Scalar
 
 
 def start(character: Character, window: Window, memory_size: int) -> ClothState:
-    """Return a garment as skinned at the current frame, moving with the body."""
+    """Return the state of a garment as skinned at the current frame, with the velocity of skinning.
+
+    Args:
+        memory_size: L, numbers of the code or memory, which starts as zeros.
+    """
     now = characters.skinned(character, window.current)
     return ClothState(
         position=now,
@@ -29,7 +33,12 @@ def start(character: Character, window: Window, memory_size: int) -> ClothState:
 def time_step(
     scene: Scene, character: Character, state: ClothState, window: Window, timestep: Scalar, config: Config
 ) -> TimeStep:
-    """Return the potential's constants for the step of `timestep` s from `window.current` to `window.following`."""
+    """Return the constants of the potential of a time step from `window.current` to `window.following`.
+
+    Args:
+        state: of the garment at the current frame.
+        timestep: s, the duration.
+    """
     physics = config.physics
     body, body_next = window.current.body, window.following.body
     ahead = state.position + state.velocity
@@ -62,7 +71,10 @@ def time_step(
 
 
 def rest_energy(scene: Scene, config: Config) -> Callable[[Array], Array]:
-    """Return the potential of displacements [V, 3] m of the configured cloth, without contact in the canonical pose."""
+    """Return the potential at rest: a function from displacements [V, 3] m to J.
+
+    It is that of the configured cloth on the mean body, in the canonical pose, standing still and without contact.
+    """
     character = characters.dress(
         scene, jnp.zeros(scene.body.shapedirs.shape[-1]), configured_material(config), config.physics
     )
