@@ -1,4 +1,4 @@
-"""The frame of every program: arguments in one spelling, compilation cache, one clear line for a user's mistake."""
+"""What all command-line programs share: the parser of arguments, the compilation cache, one-line error messages."""
 
 import argparse
 import contextlib
@@ -42,7 +42,12 @@ class Parser(argparse.ArgumentParser):
 
 
 def model_argument(parser: Parser, nargs: str | None = None, default: Any = None, about: str = "") -> None:
-    """Add the positional argument `model`, as text for `model_folder`."""
+    """Add the positional argument `model` to a parser: the text that `model_folder` takes.
+
+    Args:
+        nargs, default: as of `ArgumentParser.add_argument`.
+        about: text that is added to the help.
+    """
     parser.takes_model = True
     parser.add_argument(
         "model",

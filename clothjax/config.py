@@ -18,7 +18,7 @@ def _require(condition: bool, message: str) -> None:
 
 @dataclass(frozen=True)
 class Range:
-    """The range of a material constant in training; the networks see the constant scaled to [0, 1] over it."""
+    """The range of a material constant in training; networks read the constant scaled to [0, 1] over it."""
 
     low: float
     high: float
@@ -63,8 +63,8 @@ class PhysicsConfig:
     shaped_rest: bool = True
     """The rest shape follows the character's betas (a graded garment); false: always the template, as in HOOD."""
     contact_surface: Literal["triangles", "centroids"] = "triangles"
-    """The surface that a garment vertex can touch: the body's nearest triangle; or the plane of the face with the
-    nearest centroid, as in HOOD."""
+    """What a garment vertex can touch: the nearest triangle of the body (`triangles`), or the plane of the body face
+    whose centroid is nearest, as in HOOD (`centroids`)."""
     edge_contact: bool = True
     """Edges of the garment touch the body between their ends too, so that a limb does not slip through. Triangles only.
     """
@@ -104,7 +104,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights w_k of the training loss sum_k w_k E_k / scale (METHOD.md, Training)."""
+    """Weights w_k of the energies E_k [J] in the training loss sum_k w_k E_k / scale (METHOD.md, Training)."""
 
     stretching: Ramp = Ramp()
     bending: Ramp = Ramp()
@@ -132,7 +132,7 @@ class Stack:
 
 @dataclass(frozen=True)
 class Level:
-    """One mesh-convolution block."""
+    """One mesh-convolution block. It keeps vertices `stride` hops apart; each reads those within `radius` hops."""
 
     features: int | None = None
     """Output channels. Null, allowed for the last block: the number that gives the latent size, with no layer after it.
@@ -152,26 +152,28 @@ class ModelConfig:
     body_nodes: Literal["updated", "encoded"] = "encoded"
     """Body nodes take part in message passing (`updated`), or only send their encoding to the garment (`encoded`)."""
     canonical_features: bool = True
-    """Add the state, seen from the canonical pose at the next frame, to HOOD's features."""
+    """Give Phi the garment's state in the canonical pose of the next frame, beside HOOD's features."""
     convolution: tuple[Level, ...] = (Level(64), Level(64))
     convolution_bases: int = 8
     latent: int = 400
-    """Target size L; the actual one is the nearest multiple of the number of vertices after the convolution."""
+    """Wanted size L of the code; the actual one is the nearest multiple of the vertices that the convolution leaves."""
     latent_update: Literal["absolute", "descent"] = "descent"
-    """The output of the network: Z as in the thesis (`absolute`), or the correction of a guess (`descent`). The guess
-    is the current frame's Z, plus its last change where that helps, after some steps down the potential."""
+    """What Phi's network gives: the next code, as in the thesis (`absolute`), or a correction added to a guess of it
+    (`descent`). The guess starts at the current code, plus its last change if the potential is lower there, and takes
+    `descent_steps` steps down the potential."""
     descent_steps: int = 16
-    """Conjugate-gradient steps of the guess."""
+    """Conjugate-gradient steps that find the guess."""
     descent_samples: int = 24
-    """Autoregressive rollouts at whose ends the Hessian is evaluated; its mean preconditions the steps. 0: only the
-    Hessian at rest."""
+    """Rollouts of Phi, at whose last frames the Hessian of the potential by the code is evaluated. The mean Hessian
+    preconditions the descent. 0: the Hessian of the garment at rest takes its place."""
     descent_damping: float = 0.02
-    """J, added to the Hessian of unit codes: folds are stiffer than its mean."""
+    """J, added to the eigenvalues of that Hessian before it is inverted. It shortens steps: folds are stiffer than the
+    mean Hessian says."""
     decoder: tuple[int, ...] = (256, 256)
     """Hidden layers of the decoder, before the blend-shape weights."""
     decoder_skip: bool = True
-    """Add a linear map of Z to the decoder's output, unlike the thesis. Narrow ReLU layers alone leave the blend-shape
-    weights few directions to move in."""
+    """Add a linear map of the code to the decoder's output, unlike the thesis. Narrow ReLU layers alone leave the
+    blend-shape weights few directions to move in."""
     blendshapes: int = 384
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
@@ -221,19 +223,20 @@ class PhysicsTrainingConfig:
 
     steps: int = 12000
     batch: int = 1
-    """Simulations advanced in one update."""
+    """Simulations that one training step advances."""
     pool: int = 48
-    """Persistent simulations; `restart_probability: 1` with any pool is HOOD's restart curriculum."""
+    """Simulations that training advances in turn and keeps from step to step."""
     restart_probability: float = 1.0 / 90.0
+    """Chance, at each turn, that a simulation starts again. 1 is HOOD's restart curriculum, whatever the pool."""
     lost: float | None = None
-    """Loss from which on a simulation restarts at its next turn, like those with a vertex 5 m from the root. Null: only
-    the latter; an untrained Phi needs time to recover from its own errors."""
+    """A simulation with this loss or more starts again at its next turn, as does one with a vertex 5 m from the root.
+    Null: only the latter, for an untrained Phi needs time to recover from its own errors."""
     rollout: int = 1
-    """Frames of one update at the start."""
+    """Frames that a training step rolls out, at the start."""
     rollout_end: int = 1
-    """Most frames of one update."""
+    """The most frames that a training step rolls out."""
     rollout_every: int = 5000
-    """Steps after which the rollout grows by one frame."""
+    """Training steps after which the rollout grows by one frame."""
     gradient_frames: int = 1
     """Frames of a rollout that gradients go through. As in HOOD, 1 makes every frame's input state a constant."""
     learning_rate: float = 1e-3
@@ -253,12 +256,12 @@ class PhysicsTrainingConfig:
 
 @dataclass(frozen=True)
 class Stage1Config(PhysicsTrainingConfig):
-    """Training of Phi."""
+    """Stage 1: training of Phi on the physics."""
 
     start_timestep: float = 1.0 / 3.0  # s, of the quasi-static first step (HOOD); 0: start as skinned
     blendshape_rate: float = 0.0
-    """Learning rate of the blend shapes, relative. 0 keeps the first ones: after training, principal shapes represent
-    less of the cloth's motion on new clips."""
+    """Learning rate of the blend shapes, as a fraction of `learning_rate`. 0 keeps the first ones: once trained,
+    principal shapes represent less of the cloth's motion on new clips."""
     betas: float = 2.0  # standard deviations, drawn uniformly from +-this
 
 
@@ -269,17 +272,19 @@ class TuningConfig(PhysicsTrainingConfig):
     steps: int = 0
     pool: int = 192
     lost: float | None = 1e4
-    """An ordinary loss is 1 (skirt) to 20 (dress). Cloth inside the body may reach 1e5 and stay there. Training should
-    see cloth that can still come out do so."""
+    """As in stage 1. An ordinary loss is 1 (skirt) to 20 (dress); cloth that stays inside the body may have 1e5. Below
+    this limit cloth can still come out, and training sees it do so."""
     learning_rate: float = 1.5e-4
     clip: float = 1.5
-    """Less than nearly every gradient, so that simulations count alike: soft cloth, and cloth in the body."""
+    """Largest norm of a gradient; a longer one is scaled to it. Nearly every gradient is longer, so that all
+    simulations count alike, soft cloth and cloth inside the body too."""
     preconditioning: float = 0.5
-    """Power of the matrices that multiply gradients; 0: none.
+    """Power of the two matrices that gradients are multiplied by; 0: none.
 
-    Gradients of codes get Phi's inverse Hessian if `model.latent_update` is `descent`. Those of the first layer get the
-    inverse covariance of the poses. In standard deviations, the cloth is up to 4 000 times stiffer along some codes
-    than along others. With 1, errors of all codes would count alike, unlike their energies."""
+    They are Phi's inverse Hessian, for gradients of codes, and the inverse covariance of the pose inputs, for those of
+    the first layer. The first is there only if `model.latent_update` is `descent`. In standard deviations, the cloth is
+    up to 4 000 times stiffer along some codes than along others. With 1, errors of all codes would count alike, unlike
+    their energies."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"start_timestep": 0.0, "blendshape_rate": 0.0, "betas": ANYTHING}
 
@@ -305,20 +310,19 @@ class PeerConfig:
 
 @dataclass(frozen=True)
 class Stage2Config:
-    """Training of the latent predictor on the frozen teacher (METHOD.md, Training)."""
+    """Stage 2: training of the latent predictor on rollouts of the frozen Phi (METHOD.md, Training)."""
 
     steps: int = 6000
     batch: int = 32
     rollout: int = 16
-    """Frames predicted in a row in one update."""
+    """Frames that a training step predicts in a row."""
     noise: float = 0.3
-    """Standard deviation of the noise on the first Z of a rollout, in standard deviations of Z."""
+    """Standard deviation of the noise on the first code of a rollout, in standard deviations of the codes."""
     vertex_share: float = 0.8
     """Share of the decoded vertices' error in the loss; the rest is the code's. Both errors are fractions of a
     variance, so that parts of the code that move nothing do not crowd out the others."""
     latent_decay: float = 0.1
-    """Part of Z that decays in a frame unless the network restores it. Without it, the autoregressive rollout drifts.
-    """
+    """Share of the code that decays in a frame unless the network restores it. Without it, rollouts drift."""
     hidden: tuple[int, ...] = (512, 512)
     learning_rate: float = 1e-3
     clip: float = 1.0
@@ -356,10 +360,12 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """One experiment."""
+    """The settings of one training and of its evaluation."""
 
     garment: str = "tshirt_1000"
+    """Asset name or path of the garment."""
     body: str = "body"
+    """Asset name or path of the body that it was made for."""
     motions: tuple[str, ...] = ()
     """Training motions: asset names or paths; empty: every embedded clip except those of `evaluation`."""
     fps: float = 30.0

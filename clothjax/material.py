@@ -8,7 +8,7 @@ from clothjax.types import Array, Material
 
 
 def configured_material(config: Config) -> Material:
-    """Return the configured material."""
+    """Return the configured cloth as scalars: density [kg/m^2], mu and lambda [Pa], bending [N m]."""
     cloth = config.material
     return Material(*(jnp.float32(value) for value in (cloth.density, cloth.mu, cloth.lam, cloth.bending)))
 
@@ -36,7 +36,7 @@ def scaled(value: Array, limits: Range) -> Array:
 
 
 def unscaled(share: Array, limits: Range) -> Array:
-    """Invert `scaled`."""
+    """Invert `scaled`: return the constant for a value `share` in [0, 1] of its training range."""
     if limits.log:
         return limits.low * (limits.high / limits.low) ** share
     return limits.low + share * (limits.high - limits.low)

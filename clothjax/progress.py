@@ -17,7 +17,10 @@ def say(text: str) -> None:
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Yield a function to call with the amount done: a bar on a terminal, a line every ten seconds elsewhere."""
+    """Show the progress of a work of `total` parts: a bar on a terminal, a line every ten seconds elsewhere.
+
+    It yields a function, to be called with the number of parts done so far.
+    """
     terminal = sys.stderr.isatty() and jax.process_index() == 0
     last = time.monotonic()
     with tqdm(total=total, desc=what, disable=not terminal, leave=False) as bar:

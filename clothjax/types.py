@@ -1,9 +1,10 @@
-"""Data types that flow between the modules. SI units, +Y up.
+"""The data that modules pass to one another, as named tuples of arrays. SI units, +Y up.
 
-Sizes: V garment vertices, B body vertices, J joints, S betas, F faces, H hinges, E edges, T frames, L latent size,
-K blend shapes.
-States: x positions [m], v velocities [m per frame], z latent code, dt timestep [s], hold persistence (the positions
-of a garment that keeps its canonical displacement), lbs plain skinning.
+Letters in shapes: V garment vertices, B body vertices, J joints, S betas, F faces of the garment, Fb of the body.
+Further, H hinges, E edges, T frames, L numbers of a code, K blend shapes. [V, 3] m is one point in metres a vertex.
+
+Names in formulas and code: x positions [m], v velocities [m per frame], z code, dt time step [s], lbs the garment by
+plain skinning, hold the garment by persistence. METHOD.md has the glossary.
 """
 
 from typing import NamedTuple
@@ -49,7 +50,7 @@ class Motion(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """One frame of a motion."""
+    """One frame of a motion. A window of three frames has a leading axis 3, a batch a leading axis [N]."""
 
     rotations: Array  # [J, 3, 3] local to the parent
     translation: Array  # [3] m
@@ -65,7 +66,7 @@ class Material(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """Connectivity of a garment."""
+    """Connectivity of a garment: the elements over which its energies are sums."""
 
     faces: Array  # [F, 3] int32
     hinges: Array  # [H, 4] int32: edge (a, b), then the vertex opposite it in the left and the right face
@@ -73,7 +74,7 @@ class Mesh(NamedTuple):
 
 
 class Rest(NamedTuple):
-    """Rest measures of a shaped garment, from its canonical vertices."""
+    """The undeformed garment on a shaped body: lengths, areas and angles at which its elastic energy is zero."""
 
     inverse: Array  # [F, 2, 2] inverse of the rest edge matrix, 1/m
     face_area: Array  # [F] m^2
@@ -82,7 +83,7 @@ class Rest(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """The body surface each garment vertex may touch, frozen for one time step: a point and its normal."""
+    """One plane of the body's surface for each garment vertex, fixed during a time step: a point and a unit normal."""
 
     point: Array  # [V, 3] m, at the current frame
     point_next: Array  # [V, 3] m, the same surface point at the next frame
@@ -92,7 +93,7 @@ class Contact(NamedTuple):
 
 
 class EdgeContact(NamedTuple):
-    """The body surface each garment edge may touch between its ends, frozen for one time step."""
+    """One plane of the body's surface for each garment edge, at a place between its ends, fixed during a time step."""
 
     place: Array  # [E] from 0 at the edge's first vertex to 1 at its second
     point_next: Array  # [E, 3] m, of the body at the next frame
@@ -100,7 +101,7 @@ class EdgeContact(NamedTuple):
 
 
 class SelfContact(NamedTuple):
-    """The point of the garment that each of its vertices may touch, frozen for one time step."""
+    """The point of the garment itself that each of its vertices may touch, fixed during a time step."""
 
     corners: Array  # [V, 3] int32 vertices of the triangle
     weights: Array  # [V, 3] barycentric coordinates
@@ -108,10 +109,10 @@ class SelfContact(NamedTuple):
 
 
 class ClothState(NamedTuple):
-    """A garment in motion. Positions are relative to the root's translation at the current frame."""
+    """The state of a garment at a frame. Positions are relative to the root's translation at that frame."""
 
     position: Array  # [V, 3] m
     velocity: Array  # [V, 3] m per frame
     acceleration: Array  # [V, 3] m per frame^2
-    latent: Array  # [L] the code that produced `position`
-    change: Array  # [L] of the code in the last frame
+    latent: Array  # [L] the code that gave `position`, or a baseline's memory
+    change: Array  # [L] the code minus that of the frame before

@@ -1,8 +1,8 @@
-"""Measures of a trajectory, by the reference solver from the trajectory's own states.
+"""Measures of a garment's trajectory (METHOD.md, Measures): gaps, penetration, strain, swing, jitter.
 
-A trajectory is [T + 1, V, 3] m: the garment at every frame, relative to the root's translation at that frame.
-The solver starts every step from the trajectory. Therefore trajectories on different branches of a history-dependent
-motion are measured alike.
+A trajectory is [T + 1, V, 3] m: the garment at every frame, relative to the root's translation at that frame. For the
+gaps, the reference solver solves each sampled time step from the trajectory's own two frames before it. So a trajectory
+that has come apart from the solver's own rollout is not measured against that rollout.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ SPAN_STEPS, SPAN_BOUND = 100, 1.0  # steps, and m a step, of the search in the s
 
 
 class StepMeasure(NamedTuple):
-    """Energies of one step of a trajectory, and of other steps from the same two previous frames."""
+    """The potential of one time step of a trajectory, and of other steps from the same two frames."""
 
     energy: float  # J, of the step taken
     minimum: float  # J, the reference solver's
@@ -48,7 +48,7 @@ def step_measures(
     config: Config,
     blendshapes: Array | None = None,
 ) -> list[StepMeasure]:
-    """Measure the steps of a trajectory that leave the given frames, each solved anew.
+    """Measure the time steps of a trajectory that begin at the given frames, each by a solve of its own.
 
     Args:
         trajectory: [T + 1, V, 3] m, relative to the root.
@@ -128,7 +128,7 @@ def _search_span(scene: Scene, character: Character, blendshapes: Array, config:
 
 
 def gaps(measures: list[StepMeasure]) -> dict[str, float]:
-    """Compute `energy_gap`, `hold_gap` and `step_error_mm` of steps: means, medians and maxima.
+    """Compute `energy_gap`, `hold_gap`, `span_gap` and `step_error_mm` of time steps: means, medians and maxima.
 
     energy_gap = (E - E_min) / (E_skinned - E_min): 0 for the solver, 1 for plain skinning. hold_gap, the persistence
     gap, has E_hold in the place of E_skinned: 1 for no dynamics at all. span_gap is the hold_gap of the minimum in the
@@ -157,9 +157,17 @@ def gaps(measures: list[StepMeasure]) -> dict[str, float]:
 
 
 def penetration(garment: np.ndarray, body: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the depth [V] m of garment vertices [V, 3] m in a body [B, 3] m, 0 outside, and the nearest faces [V].
+    """Measure how deep each garment vertex is inside the body.
 
     The body is closed. Its winding number decides what is inside, independently of the planes of the collision energy.
+
+    Args:
+        garment: [V, 3] m.
+        body: [B, 3] m.
+        faces: [F, 3] of the body.
+
+    Returns:
+        Depth [V] m, 0 outside, and the nearest face [V].
     """
     signed, nearest, *_ = igl.signed_distance(
         np.asarray(garment, np.float64),
@@ -178,7 +186,14 @@ def penetrations(
     frames: Sequence[int],
     names: tuple[str, ...],
 ) -> dict:
-    """Measure how much of a garment is inside the body.
+    """Measure how much of a garment is inside the body, over frames.
+
+    Args:
+        betas: [S] of the body.
+        trajectory: [T, V, 3] m, relative to the root.
+        poses: windows [T, 3, ...] of `motion_clips.poses`.
+        frames: those to measure at.
+        names: [J] of the joints.
 
     Returns:
         `penetration_percent`: mean, median and maximum over frames. `penetration_max_mm`: the deepest vertex.
@@ -210,7 +225,7 @@ def penetrations(
 
 
 def edge_strain(scene: Scene, character: Character, trajectory: Array) -> dict[str, float]:
-    """Compute `edge_strain_p95` and `edge_strain_max` of |l / l_0 - 1| over all edges and frames."""
+    """Compute `edge_strain_p95` and `edge_strain_max`: of |l / l_0 - 1| over all edges and frames of [T, V, 3] m."""
     edges = topology.edges(np.asarray(scene.garment.faces))
     trajectory, template = np.asarray(trajectory, np.float64), np.asarray(character.template, np.float64)
 
@@ -228,9 +243,9 @@ def beside_solver(scene: Scene, trajectory: Array, solved: Array, skinned: Array
         trajectory, solved, skinned: [T, V, 3] m at the same frames, relative to the root.
 
     Returns:
-        `swing_ratio` (dynamics ratio): the rms velocity relative to skinning, over the solver's; `swing_correlation` of
-        these two velocities; `rollout_error_mm`, the mean distance of vertices; `wrinkle_ratio`, the rms dihedral angle
-        over the solver's.
+        `swing_ratio`: the rms velocity relative to skinning, over the solver's. `swing_correlation`: of these two
+        velocities. `rollout_error_mm`: the mean distance of vertices. `wrinkle_ratio`: the rms dihedral angle over the
+        solver's.
     """
     one, other, plain = (np.asarray(x, np.float64) for x in (trajectory, solved, skinned))
     swing, reference = (np.diff(x - plain, axis=0) for x in (one, other))
@@ -246,7 +261,9 @@ def beside_solver(scene: Scene, trajectory: Array, solved: Array, skinned: Array
 
 
 def roughness(trajectory: Array, advance: Array) -> float:
-    """Compute the rms of the second time difference of vertex accelerations, in m/frame^4: the numerator of `jitter`.
+    """Compute the rms fourth time difference of world positions, in m/frame^4: the numerator of `jitter`.
+
+    It is the second difference of the accelerations.
 
     Args:
         trajectory: [T, V, 3] m relative to the root.

@@ -27,7 +27,17 @@ GALLERY_SIZE = (240, 480)
 
 
 def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[np.ndarray]], list[str]]:
-    """Render rows of pictures by method, and a label for each column."""
+    """Render Phi, Psi and the solver on three bodies in several motions.
+
+    Args:
+        frame: of each motion, the one that is shown.
+
+    Returns:
+        Rows of pictures [h, w, 3] uint8 by method, and a label for each column.
+
+    Raises:
+        ValueError: for a motion without that frame.
+    """
     experiment, phi = load_run(run)
     config = experiment.config
     people = assembly.wearers(experiment)

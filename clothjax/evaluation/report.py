@@ -35,7 +35,15 @@ CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, 
 
 
 def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
-    """Evaluate models: a report under each name, and under `mean` the means of the stages that all of them have."""
+    """Evaluate several models: a report under each name, and under `mean` the means of the methods that all have.
+
+    Args:
+        folders: of the models, by name.
+        motions: asset names or paths; default: those that each model was to be validated on, as far as they are here.
+
+    Raises:
+        ValueError: if there is no model, or no motion for one.
+    """
     if not folders:
         raise ValueError("no garments come with this clothjax; train one with `python -m clothjax train`")
     reports = {}
@@ -54,9 +62,12 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) 
 
 
 def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None) -> dict:
-    """Measure a run; results are in `evaluation.<stage>` (means over motions) and `motions.<name>.<stage>`.
+    """Measure every method of a run: `lbs`, `phi` and `psi`, or `lbs` and a baseline.
+
+    Results are in `evaluation.<method>` (means over motions) and `motions.<name>.<method>`.
 
     Args:
+        motions: asset names or paths; default: those of `settings`.
         settings: default: those that the run was trained with.
 
     Raises:
@@ -98,13 +109,13 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     }
 
 
-# compiles, for a character and a clip, a function that returns the garment's trajectory [T - 2, V, 3] m, relative to
-# the root
+# a method to measure: for a character and a clip it compiles a function that returns the garment's trajectory
+# [T - 2, V, 3] m, relative to the root
 Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
 
 
 def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
-    """Return the stages to measure, by name.
+    """Return the methods to measure, by name.
 
     Args:
         model: of `load_run`.
@@ -134,9 +145,13 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
 def simulate(
     experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion
 ) -> tuple[Tracks, float]:
-    """Simulate the stages and the reference solver; also return the share of the solver's frames that converged.
+    """Roll out every method, and the reference solver over the first `evaluation.solver_frames` frames.
 
-    The solver simulates the first `evaluation.solver_frames` frames.
+    Args:
+        stages: the methods, by name.
+
+    Returns:
+        The trajectories, and the share of the solver's frames that converged.
     """
     poses = windows(clip)
     frames = poses.translation.shape[0]
@@ -155,7 +170,7 @@ def measure(
     converged: float,
     blendshapes: np.ndarray | None,
 ) -> dict[str, dict]:
-    """Measure the stages on one clip, by their names, and the reference solver.
+    """Measure the methods on one clip, by name, and under `solver` the reference solver.
 
     Args:
         tracks, converged: of `simulate`.
@@ -186,7 +201,7 @@ def measure(
 
 
 def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) -> dict[str, dict]:
-    """Measure the gaps of all stages but skinning on nine characters, over the start of a clip."""
+    """Measure the gaps of all methods but skinning on nine characters, over the start of a clip."""
     config = experiment.config
     clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
     poses = windows(clip)
@@ -205,7 +220,7 @@ def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) 
 
 
 def _long(experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion) -> dict[str, dict]:
-    """Measure all stages but skinning over the long rollout, with their times, and Psi against Phi."""
+    """Measure all methods but skinning over the long rollout, with their times, and Psi against Phi."""
     clip = assembly.there_and_back(clip, experiment.config.evaluation.long_frames + 2)
     tracks, result = {}, {}
     for name in stages:
@@ -229,7 +244,7 @@ def _long(experiment: Experiment, stages: dict[str, Stage], character: Character
 
 
 def table(stages: dict) -> str:
-    """Format the measures of the stages as a Markdown table."""
+    """Format measures as a Markdown table: a row for each measure, a column for each method."""
     rows = [f"| | {' | '.join(stages)} |", "|---" * (len(stages) + 1) + "|"]
     for name in dict.fromkeys(key for measured in stages.values() for key in measured):
         cells = (_cell(measured.get(name)) for measured in stages.values())

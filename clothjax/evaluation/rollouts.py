@@ -24,7 +24,7 @@ SETTLING_FRAMES = 5  # frames left out of averages over time: Psi starts from a 
 class Tracks(NamedTuple):
     """Trajectories [T - 2, V, 3] m of a garment over a motion, relative to the root."""
 
-    stages: dict[str, np.ndarray]  # by their names, as `lbs`, `phi` and `psi`
+    stages: dict[str, np.ndarray]  # of each method, by its name: `lbs`, `phi`, `psi` or a baseline's
     solver: np.ndarray  # of the reference solver; of a long motion, its start
 
     def save(self, run: Path, motion: str) -> None:
@@ -48,7 +48,7 @@ class Tracks(NamedTuple):
 
 
 def output_folder(run: Path) -> Path:
-    """Return the folder for trajectories: the run's own, or one for a garment of the library."""
+    """Return the folder for saved trajectories: the run's own, or `runs/pretrained/NAME` for a packed model."""
     return Path("runs") / "pretrained" / run.name if trained.packed(run) else run
 
 
@@ -57,7 +57,7 @@ def _tracks_path(run: Path, motion: str) -> Path:
 
 
 def windows(clip: Motion) -> Pose:
-    """Return every window of three poses in a clip, [T - 2, 3, ...]."""
+    """Return all windows [T - 2, 3, ...] of a clip of T frames, one around each frame but the first and the last."""
     clips = jax.tree.map(jnp.asarray, assembly.windows(clip))
     return jax.vmap(lambda t: motion_clips.poses(clips, t))(jnp.arange(1, len(clip.translation) - 1))
 
@@ -73,19 +73,27 @@ def skinned_trajectory(experiment: Experiment, character: Character, poses: Pose
 
 
 def states(make: MakeAnimator, model: dict, experiment: Experiment, character: Character, poses: Pose) -> Array:
-    """Roll an animator out: [T, V, 3] m at the middle frame of each window, relative to its root."""
+    """Roll an animator out: return the garment [T, V, 3] m at the middle frame of each window, relative to its root.
+
+    Args:
+        make: makes the animator from `model`, its `params` and `statistics`.
+        poses: windows [T, 3, ...].
+    """
     animator = make(model, experiment.scene, character, experiment.config)
     return rollout.play(animator, experiment.scene, character, poses, experiment.config).states.position
 
 
 def phi_trajectory(experiment: Experiment, phi: dict, character: Character, poses: Pose) -> np.ndarray:
-    """Roll Phi out: [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
+    """Roll Phi out: return the garment [T - 2, V, 3] m at the middle frame of each window, relative to its root."""
     play = jax.jit(lambda m, p: states(phi_animator, m, experiment, character, p))
     return np.asarray(play(phi, poses))
 
 
 def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
-    """Roll Psi out on a clip: [T - 2, V, 3] m at the same frames, relative to the root."""
+    """Roll Psi out on a clip of T frames: return the garment [T - 2, V, 3] m at the same frames as `windows` has.
+
+    It is relative to the root, as the other trajectories are.
+    """
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
     origin = part.translation[:1]
     local = part._replace(translation=(part.translation - origin).astype(np.float32), rotations=part.rotations)

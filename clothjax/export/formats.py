@@ -16,7 +16,7 @@ from clothjax.types import Motion
 
 
 class Options(NamedTuple):
-    """Choices that a format may have; a format refuses the choices of others."""
+    """The choices of an export. Not every format has `int8`, `batch` and `output`: `check` refuses them elsewhere."""
 
     int8: bool = False
     batch: int | None = 1  # characters a call, None for any number
@@ -26,9 +26,9 @@ class Options(NamedTuple):
 
 
 class Format(NamedTuple):
-    """The functions that write and run a format."""
+    """One format: how a model is written to a file, and how the file is run again to be compared with jax."""
 
-    suffix: str
+    suffix: str  # of the file, without the dot
     write: Callable[[Model, Path, Options, dict], Any]  # the last: more entries for its JSON
     run: Callable[[Path, Model, Motion, Options], np.ndarray | None]  # [T, V, 3] m; None: it cannot be run here
     options: tuple[str, ...] = ()  # fields of `Options` that not every format has

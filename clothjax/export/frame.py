@@ -15,7 +15,10 @@ RESULTS = ("next_latent", "next_rotations", "next_positions", "next_translations
 
 
 def function(model: Model) -> Callable:
-    """Return one frame as a function from `ARGUMENTS` to `RESULTS`."""
+    """Return one frame of a model as a function of plain arrays: from `ARGUMENTS` to a tuple of `RESULTS`.
+
+    The first four of each are the state, as in `inference.State`; vertices are [V, 3] m in the world.
+    """
 
     def frame(latent, previous_rotations, previous_positions, previous_translations, rotations, translation):
         state = State(latent, previous_rotations, previous_positions, previous_translations, jnp.asarray(True))
@@ -26,14 +29,14 @@ def function(model: Model) -> Callable:
 
 
 def shapes(model: Model) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arguments, all float32."""
+    """Return the shapes of `ARGUMENTS` by name; all are float32."""
     joints = len(model.parents)
     sizes = (model.network.first.shape, (2, joints, 3, 3), (2, joints, 3), (2, 3), (joints, 3, 3), (3,))
     return dict(zip(ARGUMENTS, sizes, strict=True))
 
 
 def describe(model: Model) -> dict:
-    """Return the entries of a JSON that describe the call."""
+    """Return what the JSON beside a file says of `function`: names, shapes, and how the state goes on."""
     return {
         "arguments": {name: list(shape) for name, shape in shapes(model).items()},
         "results": list(RESULTS),

@@ -40,7 +40,7 @@ def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
 
 
 def packed(model: Model) -> bytes:
-    """Return the content of a model's file."""
+    """Return a model as the bytes of a `.psi` file."""
     parts = (array.astype(array.dtype.newbyteorder("<")).tobytes() for array in _arrays(model))
     return b"".join(part + bytes(-len(part) % ALIGN) for part in parts)
 
@@ -117,6 +117,9 @@ def compiler() -> str | None:
 def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
     """Compile `psi.c` into a shared library in a folder; return its path.
 
+    Args:
+        flags: of the compiler.
+
     Raises:
         OSError: if there is no compiler, or it fails.
     """
@@ -126,7 +129,11 @@ def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
 
 
 def run_compiler(program: str | None, language: str, arguments: Sequence[str | Path]) -> None:
-    """Run a compiler.
+    """Run a compiler, and raise what it says if it fails.
+
+    Args:
+        program: its path; None if there is none.
+        language: for the message.
 
     Raises:
         OSError: if there is no compiler, or it fails.
@@ -195,7 +202,11 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def run_c(library: str | Path, path: str | Path, motion: Motion) -> np.ndarray:
-    """Run a file over a motion; return vertices [T, V, 3] m."""
+    """Run a file over a motion in plain C; return vertices [T, V, 3] m.
+
+    Args:
+        library: path of the library that `build` compiled.
+    """
     psi = Psi(library, path, motion.rotations[0], motion.translation[0])
     vertices = []
     for pose in zip(motion.rotations, motion.translation, strict=True):

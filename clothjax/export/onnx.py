@@ -53,7 +53,10 @@ def to_onnx(
 
 
 def first_state(model: Model, pose: Pose, batch: int = 1) -> list[np.ndarray]:
-    """Return `latent` and `history` before the first frame, for `batch` characters that stand in `pose`."""
+    """Return `latent` [N, C] and `history` [N, 2, 12 J + 3] before the first frame.
+
+    They are of N = `batch` characters that have been standing in `pose`.
+    """
     state = inference.initial_state(model, pose)
     rows = (state.rotations, state.translation, state.positions)
     history = np.concatenate([np.asarray(x).reshape(2, -1) for x in rows], axis=1)

@@ -27,14 +27,14 @@ TARGET = "clothjax_psi_step"
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("file",), meta_fields=("vertices",))
 @dataclasses.dataclass(frozen=True)
 class Packed:
-    """A garment on a character, packed for plain C."""
+    """A model packed for plain C."""
 
     file: Array  # [bytes] uint8, a .psi
     vertices: int
 
 
 def available() -> bool:
-    """Return whether jax computes on a CPU and both compilers are present."""
+    """Return whether `pack` can work here: jax computes on a CPU, and a C and a C++ compiler are present."""
     return jax.default_backend() == "cpu" and None not in (native.compiler(), _compiler())
 
 

@@ -22,10 +22,11 @@ STATE = {
 
 
 def write(model: Model, path: Path, output: Output, about: dict) -> None:
-    """Write the JSON beside the file `path` of a model.
+    """Write the JSON beside the file of an exported model: `path` with the suffix .json.
 
     Args:
-        about: more entries.
+        output: what vertices the file computes.
+        about: more entries, which go before those of the same name.
     """
     entries = {
         "garment": model.config.garment,

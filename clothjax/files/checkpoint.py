@@ -25,17 +25,17 @@ T = TypeVar("T")
 
 
 class Checkpoint(NamedTuple):
-    """The description of a checkpoint."""
+    """What a checkpoint says of itself, without its arrays."""
 
-    path: Path
-    step: int
-    config: dict
-    description: str
+    path: Path  # of its folder
+    step: int  # training steps so far
+    config: dict  # of the run, from `configuration.to_dict`
+    description: str  # one line for a person
     leaves: dict[str, dict]  # name -> its "shape", "dtype", "checksum" and, for random keys, "key"
 
 
 class _Damaged(Exception):
-    """The files of a checkpoint are not what was written."""
+    """A checkpoint cannot be read, or its arrays have other checksums than when it was written."""
 
 
 def save(directory: str | Path, step: int, state: Any, config: dict, description: str = "", *, keep: int = 3) -> None:
@@ -165,7 +165,10 @@ def set_aside(directory: str | Path, after: int) -> None:
 
 
 def named(tree: Any) -> dict[str, Any]:
-    """Return the leaves by path. Dictionary keys and fields of a NamedTuple look alike, so `like` can name either."""
+    """Return the leaves of a pytree by their paths, such as `params/decoder/w`.
+
+    Keys of dictionaries and fields of a NamedTuple look alike in a path, so that `like` can be either.
+    """
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     by_name = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
     assert len(by_name) == len(leaves), "two leaves of the state have the same path"

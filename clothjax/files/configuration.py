@@ -27,7 +27,7 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
         cls: a frozen dataclass whose fields are bool, int, float, str, Literal, tuples of these, Optional,
             `dict[str, X]` and dataclasses.
         path: the YAML file; `extends: other.yaml` is relative to it.
-        overrides: such as `["--train.learning_rate", "3e-4"]`.
+        overrides: such as `["--stage1.learning_rate", "3e-4"]`.
 
     Raises:
         ValueError: for a file that is missing or not YAML, a cycle of `extends:`, an unknown key, a value of the
@@ -43,7 +43,7 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
 
 
 def cli(cls: type[Config], argv: Sequence[str]) -> Config:
-    """Return the configuration of a command line: a YAML file, then overrides such as `--train.seed 3`.
+    """Return the configuration of a command line: a YAML file, then overrides such as `--stage1.seed 3`.
 
     Without a file, the overrides change the defaults of `cls`.
 

@@ -95,7 +95,7 @@ def asset_names(kind: str) -> tuple[str, ...]:
 
 
 def load_body(path: str | Path) -> Body:
-    """Read the body in a file (or embedded), with dense skinning weights [B, J] float32.
+    """Read the body in a file (or embedded asset); its skinning weights are dense, [B, J] float32.
 
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
@@ -190,7 +190,11 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
 
 
 def joint_names(path: str | Path) -> tuple[str, ...]:
-    """Read the joint names of a body or motion file (or embedded)."""
+    """Read the names [J] of the joints of a body or a motion, from a file (or embedded).
+
+    Raises:
+        ValueError: for a file that is missing or damaged.
+    """
     with _open(path, "") as file:
         return _names(file, {})
 
@@ -217,7 +221,13 @@ def save_body(
     licence: str,
     canonical_rotation: np.ndarray | None = None,
 ) -> None:
-    """Write a body, completely or not at all."""
+    """Write a body as HDF5, completely or not at all.
+
+    Args:
+        joint_names: [J] strings.
+        name, source, licence: attributes of the file.
+        canonical_rotation: [J, 3, 3], which rotates each bone of the canonical pose to a T-pose.
+    """
     data = {
         "vertices": np.float32(body.vertices),
         "faces": np.int32(body.faces),
@@ -236,7 +246,12 @@ def save_body(
 
 
 def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str) -> None:
-    """Write a garment, completely or not at all; `body` names the body it was made for."""
+    """Write a garment as HDF5, completely or not at all.
+
+    Args:
+        body: name of the body that it was made for.
+        name, source, licence: attributes of the file.
+    """
     data = {
         "vertices": np.float32(garment.vertices),
         "faces": np.int32(garment.faces),
@@ -252,7 +267,12 @@ def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, so
 def save_motion(
     path: str | Path, motion: Motion, joint_names: Sequence[str], *, name: str, source: str, licence: str
 ) -> None:
-    """Write a clip, completely or not at all."""
+    """Write a motion as HDF5, completely or not at all.
+
+    Args:
+        joint_names: [J] strings.
+        name, source, licence: attributes of the file.
+    """
     rotations = np.asarray(motion.rotations, np.float64)
     poses = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(rotations.shape[:3])
     data = {

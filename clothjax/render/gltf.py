@@ -74,7 +74,15 @@ Components = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 
 
 def principal_components(vertices: np.ndarray, tolerance: float, most: int) -> Components:
-    """Return mean [N, 3], components [K, N, 3], weights [T, K] and largest vertex error in m of [T, N, 3] m."""
+    """Compress vertices [T, N, 3] m over time by principal components.
+
+    Args:
+        tolerance: m, the vertex error at which there are enough components.
+        most: number that is not exceeded.
+
+    Returns:
+        Mean [N, 3] m, components [K, N, 3], weights [T, K] in m, and the largest vertex error in m.
+    """
     vertices = np.asarray(vertices, np.float64)
     mean = vertices.mean(axis=0)
     left, size, right = np.linalg.svd((vertices - mean).reshape(len(vertices), -1), full_matrices=False)

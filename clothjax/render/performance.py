@@ -1,4 +1,4 @@
-"""Moving meshes for animation programs: the input of `gltf`, `usd` and `point_cache`."""
+"""A character over time as moving meshes: what `gltf`, `usd` and `point_cache` write."""
 
 from typing import NamedTuple
 
@@ -6,19 +6,19 @@ import numpy as np
 
 
 class Part(NamedTuple):
-    """One mesh."""
+    """One moving mesh, such as the garment or the body."""
 
     name: str
     vertices: np.ndarray  # [T, N, 3] m, relative to the root
     faces: np.ndarray  # [F, 3]
-    colour: tuple[float, float, float]
+    colour: tuple[float, float, float]  # red, green, blue in [0, 1]
 
 
 class Performance(NamedTuple):
     """A character over time; its garment is the last of the parts."""
 
     parts: tuple[Part, ...]
-    root: np.ndarray  # [T, 3] m
+    root: np.ndarray  # [T, 3] m, place of the root in the world
     fps: float
 
     def placed(self, part: Part) -> np.ndarray:

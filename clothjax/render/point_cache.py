@@ -20,7 +20,7 @@ def to_pc2(path: str | Path, performance: Performance) -> None:
 
 
 def to_mdd(path: str | Path, performance: Performance) -> None:
-    """Write the garment as a Lightwave MDD, and NAME_mesh.obj, the mesh to put it on."""
+    """Write the garment [T, V, 3] m in the world as a Lightwave MDD, and NAME_mesh.obj, the mesh to put it on."""
     vertices = performance.placed(performance.parts[-1])
     head = np.array(vertices.shape[:2], ">i4").tobytes()
     seconds = (np.arange(len(vertices)) / performance.fps).astype(">f4").tobytes()

@@ -116,7 +116,7 @@ def render(
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return area-weighted unit normals [N, 3]."""
+    """Return area-weighted unit normals [N, 3] of vertices [N, 3] m."""
     corners = np.asarray(vertices)[np.asarray(faces)]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     summed = np.zeros((len(vertices), 3), np.float32)

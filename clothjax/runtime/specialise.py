@@ -73,16 +73,20 @@ def without_code(model: Model) -> Model:
 
 
 def equalised(model: Model) -> Model:
-    """Return the same model with blend shapes and code scaled by `smoothing_scale`.
+    """Return a model with the same results whose blend shapes and code are scaled by `smoothing_scale`.
 
-    It is for runtimes that quantise all inputs of a layer alike.
+    It is for eight bits in runtimes that quantise all inputs of a layer with one scale.
     """
     network = _equalised_shapes(model.network, np.abs(ordinary_weights(model)).max(axis=0))
     return dataclasses.replace(model, network=_equalised_code(network))
 
 
 def _equalised_shapes(network: Network, limits: np.ndarray) -> Network:
-    """Return the network with blend shapes scaled, given the largest weight `limits` [K] of each."""
+    """Scale the blend shapes, and their weights by the inverse, so that displacements stay the same.
+
+    Args:
+        limits: [K], the largest magnitude of each weight.
+    """
     scale = smoothing_scale(limits, network.shapes)
     shapes = network.shapes * scale[:, None]
     if network.mix is not None:
@@ -103,7 +107,7 @@ def _equalised_shapes(network: Network, limits: np.ndarray) -> Network:
 
 
 def _equalised_code(network: Network) -> Network:
-    """Return the network with its code scaled; a folded one as it is."""
+    """Scale the code, and the kernels that read it by the inverse; a folded network is returned as it is."""
     code, read = network.code, network.read
     if isinstance(code, FoldedLayer) or isinstance(read, FoldedLayer):
         return network
@@ -115,7 +119,7 @@ def _equalised_code(network: Network) -> Network:
 
 
 def _divided_code(network: Network, scale: np.ndarray) -> Network:
-    """Return the network that gives its code divided by `scale` [C]; the layers that read it stay."""
+    """Divide the code by `scale` [C] where it is made: last layer, bounds, first code. Who reads it must multiply."""
     *hidden, last = network.hidden
     return network._replace(
         hidden=(*hidden, Layer(last.kernel / scale[None], last.bias / scale)),
@@ -125,19 +129,24 @@ def _divided_code(network: Network, scale: np.ndarray) -> Network:
 
 
 def smoothing_scale(limits: Array, kernel: Array) -> np.ndarray:
-    """Return a scale [n] that balances inputs against weights before int8 (SmoothQuant, Xiao et al. 2023).
+    """Compute a scale [n] that balances a layer's inputs against its weights (SmoothQuant, Xiao et al. 2023).
 
-    Divide the inputs [n] by it and multiply the rows of their kernel [n, m]: all of a row share eight bits.
+    Inputs [n] are divided by it, and the rows of the kernel [n, m] multiplied, before both are rounded to eight bits.
 
     Args:
         limits: [n] largest magnitude of each input.
+        kernel: [n, m].
     """
     weights = np.abs(np.asarray(kernel)).max(axis=1)
     return np.sqrt(np.maximum(limits, 1e-6) / np.maximum(weights, 1e-6)).astype(np.float32)
 
 
 def part(model: Model, vertices: Array) -> Model:
-    """Return the model of some vertices [n] of its garment, such as the visible ones, with the faces among them."""
+    """Return the model of a part of its garment, such as what is visible.
+
+    Args:
+        vertices: [n] indices of the vertices to keep; the faces among them stay, numbered anew.
+    """
     vertices = np.unique(np.asarray(vertices))
     number = np.full(model.wearer.template.shape[-1], -1)
     number[vertices] = np.arange(len(vertices))
@@ -189,9 +198,9 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
 
 
 def ordinary_weights(model: Model) -> np.ndarray:
-    """Return blend-shape weights [n, K] of autoregressive rollouts over the calibration clips.
+    """Return the blend weights [n, K] that occur in use, from rollouts over the calibration clips.
 
-    They come from random codes for a body that the clips do not fit.
+    For a body whose joints the clips do not fit, they come from random codes.
     """
     limits = model.network.code_bounds
     try:
@@ -233,7 +242,12 @@ def _fewer_shapes(model: Model, count: int) -> Model:
 
 
 def principal_rows(weights: np.ndarray, shapes: np.ndarray, count: int) -> tuple[Layer, np.ndarray, np.ndarray]:
-    """Replace blend shapes [K, N] by fewer rows, the best for weights [n, K] that occur.
+    """Replace blend shapes by fewer ones, the best for the weights that occur.
+
+    Args:
+        weights: [n, K] of `ordinary_weights`.
+        shapes: [K, N], N being 3 V.
+        count: number of shapes to keep.
 
     Returns:
         The layer [K, count] that gives the weights of the rows, the rows [count, N], and an offset [N] to be added.

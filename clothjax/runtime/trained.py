@@ -27,12 +27,12 @@ LARGE = 2000  # entries from which a matrix is stored in eight bits
 
 
 class TrainedPsi(NamedTuple):
-    """Psi as it was trained, with the configuration of its last stage."""
+    """The trained parts of Psi, with the configuration of its last stage."""
 
     config: Config
-    garment: dict  # the decoder with its blend shapes
-    predictor: dict  # the latent predictor, after its last stage
-    normalizers: Normalizers
+    garment: dict  # parameters of the decoder with its blend shapes
+    predictor: dict  # parameters of the latent predictor, after its last stage
+    normalizers: Normalizers  # scales of its codes and pose inputs
 
 
 def shipped() -> tuple[str, ...]:
@@ -168,7 +168,9 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
     """Write a packed model; return the bytes of its weights.
 
     Args:
-        phi: `params` and `statistics`.
+        phi: its `params` and `statistics`.
+        predictor: parameters of the latent predictor.
+        normalizers: scales of its codes and pose inputs.
     """
     parts = {
         "phi": phi["params"],
