@@ -26,6 +26,7 @@ COMMANDS = {  # imported when it is run, so that the doctor can look at an insta
 
 
 def main(argv: Sequence[str] | None = None) -> None:
+    """Run the program that the first argument names; by default the arguments of this process."""
     argv = list(sys.argv[1:] if argv is None else argv)
     parser = cli.Parser("clothjax", __doc__)
     parser.add_argument("command", choices=COMMANDS, metavar=f"{{{','.join(COMMANDS)}}}")

@@ -112,7 +112,7 @@ def arguments(kind: type[Arguments], program: str, about: str | None, argv: Sequ
 
 
 def run(main: Callable[[list[str]], None]) -> None:
-    """Run a program: from its arguments to its exit code."""
+    """Run a program on the arguments of this process: `setup`, then `main` within `fail_clearly`."""
     setup()
     with fail_clearly():
         main(sys.argv[1:])
@@ -128,7 +128,13 @@ def setup() -> None:
 
 @contextlib.contextmanager
 def fail_clearly() -> Iterator[None]:
-    """End the program with one line and exit code 1 on a user's mistake or a diverged training."""
+    """End the program with one line and exit code 1 on a user's mistake or a diverged training.
+
+    With CLOTHJAX_TRACEBACK set, the error is raised instead.
+
+    Raises:
+        SystemExit: for a ValueError, an OSError, a FloatingPointError or an ImportError.
+    """
     try:
         yield
     except (ValueError, OSError, FloatingPointError, ImportError) as error:

@@ -43,7 +43,7 @@ def unscaled(share: Array, limits: Range) -> Array:
 
 
 def sample_material(key: Array, config: Config) -> Material:
-    """Draw a material from the training ranges, or return the configured one if they are not used."""
+    """Draw a material, of scalars, from the training ranges; without `material.sample` return the configured one."""
     cloth = config.material
     if not cloth.sample:
         return configured_material(config)

@@ -34,6 +34,11 @@ FRAMES = 300
 
 
 def main(argv: list[str]) -> None:
+    """Write a model for another runtime, as the arguments say.
+
+    Raises:
+        ValueError: for a mistake in the arguments, or a file that is missing or wrong.
+    """
     parser = cli.Parser("clothjax convert", __doc__)
     cli.model_argument(parser)
     parser.add_argument("--to", choices=FORMATS, default="onnx")

@@ -48,6 +48,11 @@ from clothjax.runtime import trained
 
 
 def main(argv: list[str]) -> None:
+    """Measure the models that the arguments name, print a table and write the report as JSON.
+
+    Raises:
+        ValueError: for a mistake in the arguments, or a file that is missing or wrong.
+    """
     parser = cli.Parser("clothjax evaluate", __doc__)
     cli.model_argument(parser, nargs="+", about="; several, or `all` that come with it")
     parser.add_argument("--motions", nargs="+", default=None, help="asset names or paths; default: the configured ones")

@@ -19,6 +19,11 @@ from clothjax.evaluation.rollouts import load_run
 
 
 def main(argv: list[str]) -> None:
+    """Draw the motions that the arguments name, a file for each.
+
+    Raises:
+        ValueError: for a mistake in the arguments, or a file that is missing or wrong.
+    """
     parser = cli.Parser("clothjax render", __doc__)
     cli.model_argument(parser)
     parser.add_argument(

@@ -25,6 +25,11 @@ from clothjax.training.pipeline import PHYSICS, run_directory, train
 
 
 def main(argv: list[str]) -> None:
+    """Train the run that the arguments describe.
+
+    Raises:
+        ValueError: for a mistake in the arguments, or a file that is missing or wrong.
+    """
     parser = cli.Parser("clothjax train", __doc__, settings=True, add_help=False)
     parser.add_argument("--devices", default=None)
     parser.add_argument("--processes", default="")

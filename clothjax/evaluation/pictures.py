@@ -75,7 +75,7 @@ SIZE = (360, 480)
 
 
 def perform(run: Path, experiment: Experiment, motion: str, frames: int) -> Performance:
-    """Return Psi's garment over the first frames of a clip, on the body if the scene has one."""
+    """Roll Psi out over at most `frames` frames of a clip; return the garment, on the body if the scene has one."""
     clip = assembly.motion(experiment, motion)
     garment = psi_trajectory(inference.load(run, betas=assembly.betas(experiment.config)), clip)[:frames]
     body, root = body_trajectory(experiment, clip)
@@ -108,7 +108,11 @@ def film(write: Callable) -> Callable:
 
 
 def write_comparison(run: Path, experiment: Experiment, motion: str, out: Path) -> None:
-    """Write pictures of skinning, Phi, Psi and the reference solver at the same moments of a measured clip."""
+    """Write a PNG of skinning, Phi, Psi and the reference solver at the same moments of a clip.
+
+    Raises:
+        ValueError: if `clothjax evaluate` has not measured the run on this clip.
+    """
     tracks = Tracks.load(run, motion)
     shown = {label: tracks.stages[name] for name, label in ROWS.items()} | {"reference solver": tracks.solver}
     rows, columns = at_moments(experiment, motion, shown)
@@ -158,7 +162,7 @@ def body_trajectory(
 
 
 def dressed(experiment: Experiment, body: np.ndarray, garment: np.ndarray) -> list[Surface]:
-    """Return the surfaces of a garment on a body, or of the garment alone if the scene has no body."""
+    """Return the surfaces of a garment [V, 3] m on a body [B, 3] m; of the garment alone if the scene has no body."""
     cloth = [Surface(garment, np.asarray(experiment.garment.faces))]
     return [Surface(body, np.asarray(experiment.body.faces), SKIN), *cloth] if experiment.scene.touchable else cloth
 

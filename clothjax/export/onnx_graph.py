@@ -50,7 +50,7 @@ class Graph:
         return name
 
     def reshape(self, x: str, *shape: int) -> str:
-        """Reshape all axes of x but the first, of characters, to `shape`."""
+        """Reshape x to [N, *shape]; its first axis, of characters, stays."""
         return self("Reshape", x, np.array((0, *shape), np.int64))  # 0: the axis stays
 
     def slice(self, x: str, axis: int, start: int, end: int, name: str | None = None) -> str:
@@ -63,11 +63,11 @@ class Graph:
         return inside, self("Abs", self("Sub", inside, x))
 
     def layer(self, x: str, layer: Layer) -> str:
-        """Apply a dense layer."""
+        """Apply a dense layer to x [N, inputs]; return the name of [N, outputs]."""
         return self("Add", self.product(x, layer.kernel), layer.bias)
 
     def product(self, x: str, kernel: str | Array) -> str:
-        """Apply a dense layer without a bias."""
+        """Multiply x [N, inputs] by a kernel [inputs, outputs]; it is a product that `int8` quantises."""
         return self("MatMul", x, kernel, name=f"dense_{len(self.nodes)}")
 
     def twice(self, x: str, layer: Layer) -> str:
@@ -94,7 +94,7 @@ class Graph:
         return self.layer(self("Mul", x, 1.0 / scale), Layer(np.asarray(layer.kernel) * scale[:, None], layer.bias))
 
     def all(self, flags: str, axis: int) -> str:
-        """Return whether all bools along an axis are true; the axis stays, with size 1."""
+        """Return whether all of the bools along an axis are true; the axis stays, with size 1."""
         least = self("ReduceMin", self("Cast", flags, to=self.onnx.TensorProto.FLOAT), axes=[axis], keepdims=1)
         return self("Greater", least, np.float32(0.5))
 
@@ -116,6 +116,9 @@ class Graph:
         Args:
             inputs, outputs: shapes of tensors by name.
             flags: names of those that are bool; the others are float32.
+
+        Raises:
+            ImportError: with `int8`, if onnxruntime is not installed.
         """
         helper, kinds = self.onnx.helper, self.onnx.TensorProto
         described = [
@@ -147,7 +150,11 @@ class Graph:
 
 
 def session(path: str | Path):
-    """Open a file in ONNX Runtime, on one thread."""
+    """Open a file in ONNX Runtime, on one thread of a CPU.
+
+    Raises:
+        ImportError: if onnxruntime is not installed.
+    """
     try:
         import onnxruntime
     except ImportError as error:

@@ -68,7 +68,13 @@ def _register() -> None:
 
 @functools.partial(jax.jit, static_argnames="vertices")
 def step(packed: Packed, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
-    """Take `inference.step` with a packed model, from a state that `inference.initial_state` made for the model itself.
+    """Compute the next frame as `inference.step` does, but by plain C: a new state, and vertices [V, 3] m in the world.
+
+    Args:
+        packed: of `pack`.
+        state: first that of `inference.initial_state` for the model itself.
+        pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
+        vertices: False for a garment that nobody sees: they are then None.
 
     Raises:
         jax.errors.JaxRuntimeError: for a state or a pose of another garment, or a damaged file.

@@ -124,6 +124,7 @@ class Layers(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        """Return [..., last size] of x [..., inputs]."""
         for index, size in enumerate(self.sizes):
             layer = nn.Dense(size, self.bias, kernel_init=nn.initializers.normal(0.05), name=str(index))
             x = nn.relu(layer(x))

@@ -57,6 +57,7 @@ class LayerNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        """Return the normalised rows [N, W] of x [N, W]."""
         scale = self.param("scale", nn.initializers.ones, (x.shape[-1],))
         bias = self.param("bias", nn.initializers.zeros, (x.shape[-1],))
         return _affine(jax.nn.standardize(x, epsilon=1e-5), scale, bias)

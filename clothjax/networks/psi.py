@@ -15,7 +15,13 @@ from clothjax.types import Array, Material, Pose
 
 
 def input_joints(names: tuple[str, ...], config: Stage2Config) -> np.ndarray:
-    """Return the indices of the joints that are inputs: hands, fingers and toes, which move no garment, are not."""
+    """Return the indices [Jk] of the joints whose pose Psi reads: not those of `stage2.excluded_joints`.
+
+    Hands, fingers and toes move no garment.
+
+    Args:
+        names: [J] of the joints.
+    """
     excluded = [word.lower() for word in config.excluded_joints]
     indices = [i for i, name in enumerate(names) if not any(word in name.lower() for word in excluded)]
     return np.array(indices, np.int32)

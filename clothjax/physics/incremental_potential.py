@@ -117,5 +117,8 @@ def energies(
 
 
 def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Float[Array, ""]:
-    """Incremental potential in J at unit physical weights, which a time step of the cloth minimises."""
+    """Evaluate the incremental potential at new positions [V, 3] m: the plain sum of its energies, a scalar in J.
+
+    A time step of the cloth minimises it.
+    """
     return sum(energies(new, step, mesh, config).values())  # pyright: ignore[reportReturnType]  # there are terms

@@ -85,7 +85,7 @@ def phi(run: str | Path) -> tuple[Config, dict]:
 
 
 def network(run: str | Path) -> tuple[Config, dict]:
-    """Load the same as `phi`, or a baseline's network in the place of Phi.
+    """Load the configuration with the `params` and `statistics` of Phi, or of a baseline's network.
 
     Raises:
         ValueError: if there is no readable one.
@@ -102,7 +102,9 @@ def network(run: str | Path) -> tuple[Config, dict]:
 
 
 def psi(run: str | Path) -> TrainedPsi:
-    """Load Psi from a run or a packed model. For Psi without stage 1 the normalizers are identities.
+    """Load the trained parts of Psi from a run or a packed model.
+
+    For Psi without stage 1 (`direct`) the normalizers are identities.
 
     Raises:
         ValueError: if there is no readable one.

@@ -30,7 +30,11 @@ class Experiment(NamedTuple):
 
 
 def assemble(config: Config) -> Experiment:
-    """Load the garment and the body of a configuration and build their scene."""
+    """Load the garment and the body of a configuration and build their scene.
+
+    Raises:
+        ValueError: for a file that is missing or wrong, or a garment and a body that do not fit.
+    """
     body = storage.load_body(config.body)
     garment = storage.load_garment(config.garment, body)
     return Experiment(config, storage.joint_names(config.body), body, garment, scene.build_scene(garment, body, config))
@@ -75,7 +79,11 @@ def training_motions(config: Config) -> tuple[str, ...]:
 
 
 def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
-    """Load the training clips, and return them with the number of impossibly fast frames left out of each."""
+    """Load the training clips; return them, and by name how many impossibly fast frames were left out.
+
+    Raises:
+        ValueError: as `motion`, and if no clip is long enough for a rollout.
+    """
     names = training_motions(experiment.config)
     motions = [motion(experiment, name) for name in names]
     bad = [plausibility.bad_frames(clip, experiment.body) for clip in motions]
@@ -115,7 +123,7 @@ def windows(clip: Motion) -> Clips:
 
 
 def there_and_back(clip: Motion, frames: int) -> Motion:
-    """Play a clip forwards and backwards until it has `frames` frames, without a jump."""
+    """Return a clip of `frames` frames that plays another forwards and backwards in turn, without a jump."""
     count = len(clip.translation)
     period = max(2 * count - 2, 1)
     order = np.abs((np.arange(frames) + count - 1) % period - (count - 1))
@@ -153,7 +161,7 @@ def wearers(experiment: Experiment) -> dict[str, tuple[np.ndarray, Material]]:
 
 
 def betas(config: Config) -> np.ndarray:
-    """Draw the body shape of evaluation from its own seed, uniform in +-`evaluation.betas`."""
+    """Return the body shape of evaluation: betas [S] from its own seed, uniform in +-`evaluation.betas`."""
     size = storage.load_body(config.body).shapedirs.shape[-1]
     limit = config.evaluation.betas
     return np.random.default_rng(config.evaluation.betas_seed).uniform(-limit, limit, size).astype(np.float32)

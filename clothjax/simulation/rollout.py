@@ -105,7 +105,13 @@ def advance(
 
 
 def settle(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> ClothState:
-    """Return the first state of a motion: skinned, then (HOOD) one long quasi-static step on the standing body."""
+    """Return the first state of a motion: skinned, then (HOOD) one long quasi-static step on the standing body.
+
+    Without `stage1.start_timestep` it is as skinned.
+
+    Args:
+        poses: window of the first frame, leading axis 3.
+    """
     state = start(character, characters.window(scene, character, poses), animator.memory_size)
     if config.stage1.start_timestep == 0:
         return state

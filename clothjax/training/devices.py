@@ -58,6 +58,9 @@ def together(directory: Path) -> Iterator[None]:
 
     Args:
         directory: of the run; its checkpoints are complete, so training can resume from them.
+
+    Raises:
+        Exception: the error itself, if the process is alone.
     """
     try:
         yield

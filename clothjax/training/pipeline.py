@@ -125,7 +125,7 @@ def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) ->
 
 
 def train_phi(run: Run) -> loop.Fitted:
-    """Run stage 1: prepare blend shapes and preconditioner, then train Phi on the physics."""
+    """Run stage 1: prepare blend shapes and preconditioner, then train Phi on the physics; return it, finished."""
     scene, config = run.experiment.scene, run.config
     began, new = time.monotonic(), not run.steps("stage1")
     state = stage1.init(scene, run.clips, config, _principal_shapes(run) if new else None)
@@ -149,6 +149,9 @@ def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]
 
     Returns:
         Stage 2, finished, and the seconds that were not training, by name.
+
+    Raises:
+        ValueError: if fine-tuning has begun on another stage 2, or no rollout of Phi stays finite.
     """
     scene, config = run.experiment.scene, run.config
     stage, joints = config.stage2, input_joints(run.experiment.names, config.stage2)

@@ -39,7 +39,7 @@ def dressed(scene: Scene, betas: Array, material: Material, config: Config) -> C
 
 
 def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
-    """Begin a simulation at a random frame, with random betas and material, from the skinned garment."""
+    """Return a new simulation: at a random frame, with random betas [S] and material, and the garment as skinned."""
     keys = jax.random.split(key, 3)
     betas = jax.random.uniform(
         keys[0], (scene.body.shapedirs.shape[-1],), minval=-config.stage1.betas, maxval=config.stage1.betas

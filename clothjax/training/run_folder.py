@@ -33,7 +33,10 @@ def lock(directory: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def metrics_file(directory: Path, step: int) -> Iterator[Callable[[dict[str, float]], None]]:
-    """Yield a function that appends rows to `metrics.jsonl`; rows after `step` are dropped first."""
+    """Open `metrics.jsonl` for a training that goes on from `step`; rows of later steps are dropped.
+
+    It yields a function that appends a row of figures by name.
+    """
     path = directory / "metrics.jsonl"
     lines = []
     for line in path.read_text().splitlines() if path.exists() else []:
