@@ -22,7 +22,7 @@ from clothjax.simulation.rollout import StepInput, StepOutput
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array
 
-DESCENT_BOUND = 0.3  # of a step of the descent, in Z
+DESCENT_BOUND = 0.3  # length of a descent step, in units of the code
 
 
 def latent_size(scene: Scene, config: ModelConfig) -> tuple[int, int]:
