@@ -22,7 +22,7 @@ from clothjax.networks import decoder, psi
 from clothjax.networks.normalisation import Normalizers, Scale
 from clothjax.physics import energies
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.runtime import inference
+from clothjax.runtime import inference, models
 from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes
 from clothjax.types import Body, Contact, EdgeContact, Garment, Material, Motion, SelfContact
@@ -323,7 +323,7 @@ def random_model(skip, excluded=()):
         return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
 
     normalizers = Normalizers(scale(LATENT, -20, 1.0), scale(count, -1e3, 0.5))
-    return inference.build(
+    return models.build(
         config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=np.ones(10)
     )
 

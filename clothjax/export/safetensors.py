@@ -9,7 +9,7 @@ import numpy as np
 
 from clothjax.config import Config
 from clothjax.files import configuration, storage
-from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model, Network, Wearer
+from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model, Network, Wearer
 
 FORMAT = 1  # of the file; readers refuse a newer one
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field

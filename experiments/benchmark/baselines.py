@@ -15,7 +15,7 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.networks import baselines
 from clothjax.networks.mlp import Params
 from clothjax.runtime import specialise
-from clothjax.runtime.inference import Layer
+from clothjax.runtime.models import Layer
 
 JOINTS = 15  # that NCS reads, as published
 

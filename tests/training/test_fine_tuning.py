@@ -13,7 +13,7 @@ from clothjax.body import motion_clips
 from clothjax.config import Config, LossConfig, Ramp, TuningConfig
 from clothjax.networks import animators, normalisation
 from clothjax.networks.normalisation import Normalizers, Scale
-from clothjax.runtime import inference
+from clothjax.runtime import inference, models
 from clothjax.simulation import assembly, characters
 from clothjax.simulation.rollout import StepInput
 from clothjax.training import fine_tuning, stage1
@@ -32,9 +32,7 @@ def toy():
 def test_psi_in_training_is_psi_in_use(toy):
     whole, _, kept, garment, predictor, normalizers = toy
     config, betas = whole.config, jnp.linspace(-1, 1, 10)
-    model = inference.build(
-        config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=betas
-    )
+    model = models.build(config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=betas)
     clip = assembly.motion(whole, "walk_0")
     pose = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(5)]
     state = inference.initial_state(model, pose[0])

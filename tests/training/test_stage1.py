@@ -118,9 +118,9 @@ def test_phi_does_not_see_place_or_heading(toy, update):
     np.testing.assert_allclose(elsewhere, plain, atol=2e-5)
     turned = motion._replace(translation=motion.translation @ turn.T)
     heading, _ = _play(whole, reel, model, turned, turn)
-    # The root joint, about which the body turns, is not at the origin. A turned body differs by rounding, 3e-7 m. From the
-    # second frame on a choice of the line search may fall otherwise: 3e-5 m there and 2e-4 m in the eighth were seen,
-    # over four seeds, as much as from a rounding of the poses alone.
+    # The root joint, about which the body turns, is not at the origin. A turned body differs by rounding, 3e-7 m. From
+    # the second frame on a choice of the line search may fall otherwise: 3e-5 m there and 2e-4 m in the eighth were
+    # seen, over four seeds, as much as from a rounding of the poses alone.
     difference = (heading - root) - (plain - root) @ turn.T
     np.testing.assert_allclose(difference[0], 0.0, atol=2e-6)
     np.testing.assert_allclose(difference[:8], 0.0, atol=5e-4)
