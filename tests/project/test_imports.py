@@ -11,6 +11,8 @@ ROOT = Path(__file__).parents[2]
 HOST = {  # NumPy only
     "config",
     "files.configuration",
+    "files.damage",
+    "files.hdf5",
     "files.storage",
     "geometry.mesh_hierarchy",
     "geometry.topology",
