@@ -240,12 +240,12 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
         ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
     """
     run_psi = trained.psi(trained.find(run))
-    body = storage.load_body(run_psi.config.body)
+    body, names = storage.load_rig(run_psi.config.body)
     return build(
         run_psi.config,
         storage.load_garment(run_psi.config.garment, body),
         body,
-        storage.joint_names(run_psi.config.body),
+        names,
         run_psi.garment,
         run_psi.predictor,
         run_psi.normalizers,

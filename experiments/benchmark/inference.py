@@ -131,23 +131,23 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     forms["half of the shapes"] = specialise.specialise(model, blendshapes=len(model.network.shapes) // 2)
     forms["4 influences"] = specialise.specialise(model, max_influences=4)
     library = _library(folder)
-    calls, found = {}, {}
+    calls, outcomes = {}, {}
     for name, form in forms.items():
         for int8 in (False, True):
             path = onnx.to_onnx(form, folder / "form.onnx", int8=int8)
             error = np.linalg.norm(onnx.run_onnx(path, form, motion) - reference, axis=-1)
             kind = f"{name}, int8" if int8 else name
             calls[kind] = onnx_call(path, form)
-            found[kind] = (error, path.stat().st_size, "onnx")
+            outcomes[kind] = (error, path.stat().st_size, "onnx")
         if library:
             path = native.to_c(form, folder / "form.psi")
             error = np.linalg.norm(native.run_c(library, path, motion) - reference, axis=-1)
             calls[f"C: {name}"] = c_call(library, path, form)
-            found[f"C: {name}"] = (error, path.stat().st_size, "c")
+            outcomes[f"C: {name}"] = (error, path.stat().st_size, "c")
         if name in ("plain", "folded", "a third of the shapes"):
             error = np.linalg.norm(np.asarray(inference.animate(form, motion)[0]) - reference, axis=-1)
             calls[f"jax: {name}"] = jax_call(form)
-            found[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), "jax")
+            outcomes[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), "jax")
     folded = forms["folded"]
     fine = specialise.on_mesh(model, storage.load_garment(FINE, storage.load_body(config.body)), betas)
     fine = specialise.specialise(fine)
@@ -171,7 +171,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     variants = [
         {"name": name, "us": us[name], "error_mm": 1e3 * float(error.mean()), "error_mm_max": 1e3 * float(error.max()),
          "bytes": size, "floor_us": floor_us(size), "runtime": runtime}
-        for name, (error, size, runtime) in found.items()
+        for name, (error, size, runtime) in outcomes.items()
     ]  # fmt: skip
     exact = stablehlo.run_stablehlo(stablehlo.to_stablehlo(folded, folder / "form.stablehlo"), folded, motion)
     worst = {v["name"]: v["error_mm_max"] for v in variants}
@@ -301,16 +301,16 @@ def given_features(model: Model, path: Path, *, int8: bool, skinned: bool = True
     """
     g, network = Graph(int8), model.network
     count, size, vertices = len(network.pose_mean), len(network.first), model.wearer.template.shape[1]
-    given, found = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
+    inputs, outputs = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
     if skinned:
-        given["transforms"], found["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
+        inputs["transforms"], outputs["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
         moved = g.skinned(onnx.canonical(g, latent, model), "transforms", network.weights)
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")
     else:
-        found["weights"] = (1, len(network.shapes))
+        outputs["weights"] = (1, len(network.shapes))
         g("Identity", onnx.shape_weights(g, latent, model), name="weights")
-    g.save(path, given, found)
+    g.save(path, inputs, outputs)
     return path
 
 

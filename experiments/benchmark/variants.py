@@ -94,11 +94,11 @@ def every(
     for run in runs:
         network = trained.network(run)[0].peer.network
         if network in ("ncs", "snug"):
-            found = _baseline(case, run, folder, shapes)
+            of_run = _baseline(case, run, folder, shapes)
         else:
-            found = _psi(case, run, network or "psi", folder, shapes)
-            found |= {} if network else _phi(case, run, descent_steps)
-        variants |= {(str(run), name): each for name, each in found.items()}
+            of_run = _psi(case, run, network or "psi", folder, shapes)
+            of_run |= {} if network else _phi(case, run, descent_steps)
+        variants |= {(str(run), name): each for name, each in of_run.items()}
     solver, solved = _solver(case, iterations)
     others = solver | _position_based(case, [track[0] for track in solved])
     return variants | {("", name): each for name, each in others.items()}, solved

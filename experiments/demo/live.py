@@ -65,10 +65,10 @@ class Outfit:
 
     def psi(self, poses: list[Pose]) -> np.ndarray:
         """Return vertices [N, V, 3] m of the next frame, for the characters' poses."""
-        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
+        together = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
         if self._states is None:
-            self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(given)
-        self._states, vertices = inference.step_crowd(self._crowd, self._states, given)
+            self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(together)
+        self._states, vertices = inference.step_crowd(self._crowd, self._states, together)
         return np.asarray(vertices)
 
     def beside(self, stages: list[str], window: Pose) -> dict[str, np.ndarray]:

@@ -50,9 +50,9 @@ def main(argv: list[str]) -> None:
     clips = {Path(name).stem: storage.load_motion(name, first.names) for name in arguments.motions}
     if len(clips) < len(arguments.motions):
         raise ValueError(f"two motions have one name: {', '.join(arguments.motions)}; rename one")
-    for name, given in (clips | {name: model.config for name, model in garments.items()}).items():
-        if abs(given.fps - first.config.fps) > 1e-3:
-            raise ValueError(f"{name} has {given.fps} frames a second, {next(iter(garments))} {first.config.fps}")
+    for name, timed in (clips | {name: model.config for name, model in garments.items()}).items():
+        if abs(timed.fps - first.config.fps) > 1e-3:
+            raise ValueError(f"{name} has {timed.fps} frames a second, {next(iter(garments))} {first.config.fps}")
     with progress_bar("exporting", len(garments)) as report:
         for index, (name, model) in enumerate(garments.items()):
             onnx.to_onnx(specialise.specialise(model), arguments.out / "garments" / f"{name}.onnx", int8=True)

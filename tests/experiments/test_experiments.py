@@ -18,7 +18,7 @@ from clothjax.simulation import assembly, scene
 from clothjax.training import pipeline
 from clothjax.types import Motion
 from experiments import evaluate, gallery, quickstart, render, tune
-from experiments.stability import closed_loop
+from experiments.stability import rollouts as stability_rollouts
 from experiments.stability.report import main, solver
 
 TOY = [
@@ -109,8 +109,8 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
         checkpoint.named(model).items(), checkpoint.named(model_packed).values(), strict=True
     ):
         assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
-    whole = assembly.assemble(config)
-    clip = assembly.motion(whole, "walk_3")
+    experiment = assembly.assemble(config)
+    clip = assembly.motion(experiment, "walk_3")
     one, other = (rollouts.psi_trajectory(models.load(which), clip)[:20] for which in (finished, "toy"))
     assert 0 < metrics.distance_mm(one, other).max() < 1.0
     with pytest.raises(ValueError, match=r"coat: no such folder, and no garment called so .* or a name: toy"):
@@ -188,12 +188,12 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
 
 
 def test_wearers_are_thin_and_heavy_soft_and_stiff():
-    whole = assembly.assemble(Config())
-    wearers = assembly.wearers(whole)
+    experiment = assembly.assemble(Config())
+    wearers = assembly.wearers(experiment)
     assert len(wearers) == 9
 
     def size(betas):
-        return np.ptp(np.asarray(whole.body.vertices + np.asarray(whole.body.shapedirs) @ betas), axis=0)
+        return np.ptp(np.asarray(experiment.body.vertices + np.asarray(experiment.body.shapedirs) @ betas), axis=0)
 
     sizes = [size(wearers[f"{shape}, soft"][0]) for shape in ("thin", "mean", "heavy")]
     _, (low, middle, high), (thin, mean, heavy) = np.transpose(sizes)
@@ -247,25 +247,25 @@ def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
 
 def test_frame_rates_must_agree(tmp_path):
     config = Config(fps=60.0)
-    whole = assembly.assemble(config)
+    experiment = assembly.assemble(config)
     with pytest.raises(ValueError, match=r"walk_0 has 30\.0 frames a second, the experiment 60\.0"):
-        assembly.motion(whole, "walk_0")
+        assembly.motion(experiment, "walk_0")
 
 
 def test_the_body_in_reach_reaches_beyond_the_garment_without_head_or_hands():
-    whole = assembly.assemble(Config())
-    dominant = {whole.names[j] for j in np.asarray(whole.scene.body.weights).argmax(1)}
+    experiment = assembly.assemble(Config())
+    dominant = {experiment.names[j] for j in np.asarray(experiment.scene.body.weights).argmax(1)}
     assert {"Hips", "Spine", "LeftArm", "RightForeArm", "LeftUpLeg"} <= dominant
     assert not {"Head", "LeftHand", "RightHandFinger1", "LeftFoot"} & dominant
-    low = np.asarray(whole.scene.garment.vertices)[:, 1].min()
-    assert np.asarray(whole.scene.body.vertices)[:, 1].min() < low - 0.2
+    low = np.asarray(experiment.scene.garment.vertices)[:, 1].min()
+    assert np.asarray(experiment.scene.body.vertices)[:, 1].min() < low - 0.2
 
 
 def test_a_garment_elsewhere_is_refused():
-    whole = assembly.assemble(Config())
-    far = whole.garment._replace(vertices=whole.garment.vertices + 5)
+    experiment = assembly.assemble(Config())
+    far = experiment.garment._replace(vertices=experiment.garment.vertices + 5)
     with pytest.raises(ValueError, match="no part of the body is within"):
-        scene.reachable(whole.body, far, 0.35)
+        scene.reachable(experiment.body, far, 0.35)
 
 
 def test_statistics_are_those_of_all_rows_counted():
@@ -289,7 +289,7 @@ def test_statistics_are_those_of_all_rows_counted():
 def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
     """Its two-minute version, with the closed loops of a run that was hardly trained: they need not be good."""
     monkeypatch.setattr(solver, "stress", lambda *_: {})  # has tests of its own
-    monkeypatch.setattr(closed_loop, "AFTER", 20)
+    monkeypatch.setattr(stability_rollouts, "AFTER", 20)
     main([str(finished), "--quick", "--json", str(tmp_path / "s.json")])
     report = json.loads((tmp_path / "s.json").read_text())
     assert report["physics"]["configurations"] == 9000 and report["physics"]["nonfinite"] == 0

@@ -198,8 +198,7 @@ def test_asset_names_and_paths():
 
 
 def test_every_asset_loads():
-    body = storage.load_body("body")
-    names = storage.joint_names("body")
+    body, names = storage.load_rig("body")
     assert storage.asset_names("body") == ("body",)
     for name in storage.asset_names("garment"):
         garment = storage.load_garment(name, body)

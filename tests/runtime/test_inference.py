@@ -18,12 +18,12 @@ from clothjax.types import Material, Motion, Pose
 def trained():
     """A model after a few steps of both stages: its numbers mean nothing, its code paths all do."""
     config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    first, _ = stage1.make_update(whole.scene, reel, config, 1, 20)(stage1.init(whole.scene, reel, config))
-    joints = psi.input_joints(whole.names, config.stage2)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    first, _ = stage1.make_update(experiment.scene, reel, config, 1, 20)(stage1.init(experiment.scene, reel, config))
+    joints = psi.input_joints(experiment.names, config.stage2)
     phi = {"params": first.params, "statistics": first.statistics}
-    teacher, _ = stage2.teach(phi, whole.scene, reel, joints, config)
+    teacher, _ = stage2.teach(phi, experiment.scene, reel, joints, config)
     second, _ = stage2.make_update(teacher, config, 20)(stage2.init(teacher, first.params["garment"], config))
     # twelve frames of a teacher span next to nothing: as if it had seen more
     wide = normalisation.Normalizers(*(
@@ -32,11 +32,11 @@ def trained():
 
     def wearer(betas, material=None):
         return models.build(
-            config, whole.garment, whole.body, whole.names, second.garment, second.params, wide,
+            config, experiment.garment, experiment.body, experiment.names, second.garment, second.params, wide,
             betas=betas, material=material,
         )  # fmt: skip
 
-    clip = assembly.motion(whole, "walk_3")
+    clip = assembly.motion(experiment, "walk_3")
     motion = Motion(clip.rotations[:30], clip.translation[:30].astype(np.float32), clip.fps)
     return wearer(np.linspace(-1, 1, 10)), motion, teacher, wearer
 
