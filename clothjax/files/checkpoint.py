@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from clothjax.files import damage
+
 FORMAT = 1
 """Version of the format; readers refuse a newer one."""
 
@@ -108,22 +110,15 @@ def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tu
     Raises:
         ValueError: if there is no undamaged checkpoint, or a leaf is missing, left over or of another shape.
     """
-    return _restore(Path(directory).resolve(), like, step, whole=True)
+    wanted = named(like)
 
+    def read_one(path: Path) -> tuple[Tree, Checkpoint]:
+        checkpoint = _about(path)
+        _check(checkpoint, wanted)
+        leaves = _leaves(checkpoint, wanted)
+        return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in wanted]), checkpoint
 
-def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
-    """Read only the parts of the state that `like` names, otherwise as `restore`.
-
-    Args:
-        directory: of all checkpoints of a run.
-        like: a dictionary from some of the state's keys or fields to trees as in `restore`, such as
-            `{"params": ..., "statistics": ...}`.
-        step: of one checkpoint, instead of the newest.
-
-    Raises:
-        ValueError: if there is no undamaged checkpoint, or a leaf is missing or of another shape.
-    """
-    return _restore(Path(directory).resolve(), like, step, whole=False)
+    return _newest(Path(directory).resolve(), step, read_one)
 
 
 def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint]:
@@ -206,9 +201,9 @@ def _newest(directory: Path, step: int | None, read: Callable[[Path], T]) -> T:
     for number in reversed(existing if step is None else [step]):
         try:
             return read(directory / str(number))
-        except _Damaged as damage:
-            reason = f"{directory / str(number)} is damaged ({damage})"
-            warnings.warn(f"{reason}; looking for an older checkpoint", stacklevel=4)
+        except _Damaged as error:
+            reason = f"{directory / str(number)} is damaged ({error})"
+            warnings.warn(f"{reason}; looking for an older checkpoint", stacklevel=3)
     raise ValueError(f"{directory}: no undamaged checkpoint: {reason}")
 
 
@@ -221,25 +216,11 @@ def _about(path: Path) -> Checkpoint:
         checkpoint = Checkpoint(path, about["step"], about["config"], about["description"], about["leaves"])
     except Exception as error:  # Orbax raises many kinds for broken files; the message has the reason
         raise _Damaged(f"its description cannot be read: {_first_line(error)}") from error
-    if version > FORMAT:
-        raise ValueError(f"{path}: has format {version}, this version of clothjax reads up to {FORMAT}; update it")
+    damage.refuse_newer(path, version, FORMAT)
     return checkpoint
 
 
-def _restore(directory: Path, like: Tree, step: int | None, *, whole: bool) -> tuple[Tree, Checkpoint]:
-    """Read the leaves of `like`; with `whole`, refuse a checkpoint that has others."""
-    wanted = named(like)
-
-    def read(path: Path) -> tuple[Tree, Checkpoint]:
-        checkpoint = _about(path)
-        _check(checkpoint, wanted, whole)
-        leaves = _leaves(checkpoint, wanted)
-        return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in wanted]), checkpoint
-
-    return _newest(directory, step, read)
-
-
-def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
+def _check(checkpoint: Checkpoint, wanted: dict[str, Any]) -> None:
     """Raise a ValueError if names, shapes or dtypes differ. Orbax's partial restore accepts this silently."""
     hint = "another garment, other model sizes or another version of the model"
     for name, leaf in wanted.items():
@@ -251,7 +232,7 @@ def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
                 f"{checkpoint.path}: {name} is {stored['dtype']}{stored['shape']}, "
                 f"this model needs {leaf.dtype}{list(leaf.shape)}: {hint}"
             )
-    left_over = sorted(set(checkpoint.leaves) - set(wanted)) if whole else []
+    left_over = sorted(set(checkpoint.leaves) - set(wanted))
     if left_over:
         raise ValueError(f"{checkpoint.path}: holds {', '.join(left_over[:5])}, which this model has not: {hint}")
 

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import shutil
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -30,6 +31,17 @@ TOY = [
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
     "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
+
+
+class Picture(NamedTuple):
+    width: int
+    height: int
+    frames: int
+
+
+def picture(path):
+    with Image.open(path) as opened:
+        return Picture(*opened.size, getattr(opened, "n_frames", 1))
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +76,8 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
     assert report["quickstart"]["train_seconds"] > 0
     assert report["quickstart"]["onnx_error_mm"] < 0.1
     assert "hold_gap" in (finished / "report.md").read_text()
-    assert Image.open(finished / "comparison.png").size[0] > 1000
-    assert Image.open(finished / "walk.webp").n_frames == 6
+    assert picture(finished / "comparison.png").width > 1000
+    assert picture(finished / "walk.webp").frames == 6
     assert (finished / "tshirt.glb").stat().st_size > 10_000
     assert json.loads((finished / "tshirt.json").read_text())["shapes"]["rotations"] == [1, 31, 3, 3]
 
@@ -83,16 +95,16 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch
     assert "twist_3" in json.loads((finished / "twist.json").read_text())["motions"]
     assert "| hold_gap |" in capsys.readouterr().out
     render.main([str(finished), "--motions", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
-    assert Image.open(finished / "t.webp").n_frames == 3
+    assert picture(finished / "t.webp").frames == 3
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
-    picture = finished / "bodies.png"
+    path = finished / "bodies.png"
     monkeypatch.setattr(pictures, "GALLERY_BODIES", ("heavy",))
-    gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(picture)])
-    width, height = Image.open(picture).size
+    gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(path)])
+    width, height, _ = picture(path)
     assert width > pictures.GALLERY_SIZE[0] and height > 3 * pictures.GALLERY_SIZE[1]  # a body; three methods
     with pytest.raises(ValueError, match=r"twist_3 has frames 1 to \d+ to show, not 1000"):
-        gallery.main([str(finished), "--motions", "twist_3", "--frame", "1000", "--out", str(picture)])
+        gallery.main([str(finished), "--motions", "twist_3", "--frame", "1000", "--out", str(path)])
 
 
 def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
@@ -300,4 +312,4 @@ def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
     # a teacher of a few frames knows next to nothing, and so says Psi
     assert report["closed_loop"]["loops"]["long"]["flagged"] > 0
     assert "| long | 1000 | 0 |" in capsys.readouterr().out
-    assert Image.open(tmp_path / "s.png").width > 500
+    assert picture(tmp_path / "s.png").width > 500
