@@ -61,7 +61,7 @@ def main(argv: list[str]) -> None:
     shipped = arguments.model in trained.shipped()
     out = arguments.out or (Path(".") if shipped else run) / f"{model.config.garment}.{form.suffix}"
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
-    error = formats.export(model, arguments.to, out, options, about, _validation(model))
+    error = formats.export(model, arguments.to, out, options, about, validation(model))
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
     if error is None:
         print(f"not compared: {form.not_run}")
@@ -77,7 +77,7 @@ def _batch(given: str) -> int | None:
     return None if given == "dynamic" else int(given)
 
 
-def _validation(model: Model) -> Motion:
+def validation(model: Model) -> Motion:
     """Return the first validation motion that is present, for FRAMES frames."""
     names = [name for name in model.config.evaluation.motions if storage.asset(name).is_file()]
     clip = storage.load_motion(names[0] if names else "walk_3", model.names)

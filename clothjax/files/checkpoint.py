@@ -96,16 +96,15 @@ def latest(directory: str | Path) -> Checkpoint:
     Raises:
         ValueError: if there is none, or a newer version of this library wrote it.
     """
-    return _newest(Path(directory).resolve(), None, _about)
+    return _newest(Path(directory).resolve(), _about)
 
 
-def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
+def restore(directory: str | Path, like: Tree) -> tuple[Tree, Checkpoint]:
     """Read the complete state of the newest undamaged checkpoint, bit for bit; warn of damaged ones.
 
     Args:
         directory: of all checkpoints of a run.
         like: a state of the expected structure, shapes, dtypes and sharding: arrays or `jax.ShapeDtypeStruct`s.
-        step: of one checkpoint, instead of the newest.
 
     Raises:
         ValueError: if there is no undamaged checkpoint, or a leaf is missing, left over or of another shape.
@@ -118,7 +117,7 @@ def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tu
         leaves = _leaves(checkpoint, wanted)
         return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in wanted]), checkpoint
 
-    return _newest(Path(directory).resolve(), step, read_one)
+    return _newest(Path(directory).resolve(), read_one)
 
 
 def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint]:
@@ -146,7 +145,7 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
         leaves = _leaves(about, named(like))
         return jax.tree.unflatten(jax.tree.structure(like), leaves.values()), about
 
-    return _newest(Path(directory).resolve(), None, read_one)
+    return _newest(Path(directory).resolve(), read_one)
 
 
 def set_aside(directory: str | Path, after: int) -> None:
@@ -190,15 +189,13 @@ def _checksum(array: jax.Array) -> int | None:
     return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
 
 
-def _newest(directory: Path, step: int | None, read: Callable[[Path], T]) -> T:
+def _newest(directory: Path, read: Callable[[Path], T]) -> T:
     """Call `read` on the newest checkpoint that is not damaged."""
     existing = steps(directory)
     if not existing:
         why = "holds no checkpoints (folders named by a step)" if directory.is_dir() else "does not exist"
         raise ValueError(f"{directory}: {why}; train first, or give the folder of another run")
-    if step is not None and step not in existing:
-        raise ValueError(f"{directory}: no checkpoint of step {step}; there are {existing}")
-    for number in reversed(existing if step is None else [step]):
+    for number in reversed(existing):
         try:
             return read(directory / str(number))
         except _Damaged as error:
