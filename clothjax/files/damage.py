@@ -18,6 +18,13 @@ class NewerFormat(ValueError):
 
 
 def refuse_newer(path: str | Path, version: int, known: int) -> None:
-    """Raise NewerFormat for a file of a format that is newer than the known one."""
+    """Refuse a file that a newer version of this library wrote.
+
+    Args:
+        version, known: numbers of the file's format, and of the newest that is known here.
+
+    Raises:
+        NewerFormat: if `version` is the larger.
+    """
     if version > known:
         raise NewerFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")

@@ -167,7 +167,11 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
 
 
 def joint_names(path: str | Path) -> tuple[str, ...]:
-    """Read the joint names of a body or motion file (or embedded)."""
+    """Read the names [J] of the joints of a body or a motion, from a file (or embedded).
+
+    Raises:
+        ValueError: for a file that is missing or damaged.
+    """
     with hdf5.reading(asset(path), "") as file:
         return file.texts("joint_names", ("J",))
 

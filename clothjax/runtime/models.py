@@ -31,13 +31,17 @@ class Layer(NamedTuple):
 
 
 class FoldedLayer(NamedTuple):
-    """A layer that reads the code of a specialised model: the code carries the product with its kernel."""
+    """What a specialised model keeps of a layer that reads the code: the bias alone.
+
+    The state of such a model carries the code's products with the kernels of these layers in place of the code
+    (`specialise.without_code`).
+    """
 
     bias: Array  # [outputs]
 
 
 class Bounds(NamedTuple):
-    """Range seen in training; `slack` is how far outside still counts as inside."""
+    """The range of inputs or codes in training; values are clipped to it."""
 
     low: Array
     high: Array
@@ -45,7 +49,11 @@ class Bounds(NamedTuple):
 
 
 class Network(NamedTuple):
-    """Psi from pose inputs [P] and the code [C] to blend shapes [K, 3 V]: the part that all characters share."""
+    """The arrays of Psi that all characters share: latent predictor, decoder, blend shapes, skinning weights.
+
+    P counts pose inputs, H the predictor's first hidden layer, D the decoder's first layer. C counts what the state
+    carries: the code, C = L, or its products with the layers that read it, if the model is specialised.
+    """
 
     pose: Array  # [P, H] kernel of the predictor's first layer
     pose_mean: Array  # [P] mean of the inputs, subtracted first
@@ -72,7 +80,7 @@ class Network(NamedTuple):
 
 
 class Wearer(NamedTuple):
-    """The arrays that depend on the betas and the material of one character."""
+    """The arrays of a model that depend on its character: on betas and material."""
 
     bias: Array  # [H] added to the predictor's first layer
     template: Array  # [3, V] m, the shaped garment in the canonical pose
@@ -87,7 +95,7 @@ class Wearer(NamedTuple):
 )
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A garment on a character, ready to run: arrays as a pytree, the rest static."""
+    """A trained Psi on one character, ready to run: a pytree whose other fields are static."""
 
     network: Network
     wearer: Wearer  # of a crowd, with a leading axis [N]
@@ -100,7 +108,7 @@ class Model:
 
 
 class State(NamedTuple):
-    """The state that the model carries from frame to frame."""
+    """What a model carries from frame to frame."""
 
     latent: Array  # [C] the code, in standard deviations; of a folded model its products with the layers that read it
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
@@ -121,11 +129,15 @@ def build(
     betas: Array | None = None,
     material: Material | None = None,
 ) -> Model:
-    """Build the model of one character.
+    """Build the model of one character from what training gave.
 
     Scales and constants of the inputs are folded into the layers that read them.
 
     Args:
+        garment, body, names: as loaded by `storage`; names [J] of the joints.
+        garment_params: parameters of the decoder with its blend shapes.
+        predictor: parameters of the latent predictor.
+        normalizers: scales of its codes and pose inputs.
         betas: [S] body shape; default the mean body.
         material: default the configured one.
 

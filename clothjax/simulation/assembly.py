@@ -30,7 +30,11 @@ class Experiment(NamedTuple):
 
 
 def assemble(config: Config) -> Experiment:
-    """Load the garment and the body of a configuration and build their scene."""
+    """Load the garment and the body of a configuration and build their scene.
+
+    Raises:
+        ValueError: for a file that is missing or wrong, or a garment and a body that do not fit.
+    """
     body, names = storage.load_rig(config.body)
     garment = storage.load_garment(config.garment, body)
     return Experiment(config, names, body, garment, scene.build_scene(garment, body, config))

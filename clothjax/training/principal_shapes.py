@@ -24,7 +24,17 @@ MAX_STEP = 1.0  # m, length of a descent step of all vertices together
 
 
 def principal(frames: np.ndarray, scene: Scene, config: Config) -> np.ndarray:
-    """Compute principal components [K, V, 3] m of `simulate`, with the scale of `laplacian_shapes.laplacian`."""
+    """Compute blend shapes [K, V, 3] m: the principal components of the displacements that `simulate` gives.
+
+    Each is scaled to the energy of a shape of `laplacian_shapes.laplacian`.
+
+    Args:
+        progress: called with the number of simulations done.
+        device_mesh: each device simulates a part of them.
+
+    Raises:
+        ValueError: as `simulate`.
+    """
     rows = frames.reshape(-1, frames[0, 0].size).astype(np.float64)
     count = min(config.model.blendshapes, len(rows), rows.shape[1])
     # eigenvectors of the smaller of the two products; the mean is one of the components
