@@ -4,16 +4,16 @@ import importlib
 
 _HOMES = {
     "animate": "runtime.inference",
-    "crowd": "runtime.inference",
+    "crowd": "runtime.models",
     "initial_state": "runtime.inference",
-    "load": "runtime.inference",
+    "load": "runtime.models",
     "load_motion": "files.storage",
     "Material": "types",
-    "Model": "runtime.inference",
+    "Model": "runtime.models",
     "Motion": "types",
     "Pose": "types",
     "specialise": "runtime.specialise",
-    "State": "runtime.inference",
+    "State": "runtime.models",
     "step": "runtime.inference",
     "step_crowd": "runtime.inference",
 }

@@ -14,7 +14,8 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from clothjax.files.storage import UNREADABLE, Rig, canonical_rotation, load_rig
+from clothjax.files.damage import UNREADABLE
+from clothjax.files.storage import Rig, canonical_rotation, load_rig
 from clothjax.types import Motion
 from data_prep.program import MotionOptions, run, write_motion
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand

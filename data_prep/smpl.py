@@ -17,7 +17,8 @@ import numpy as np
 import scipy.sparse
 import tyro
 
-from clothjax.files.storage import UNREADABLE, save_body
+from clothjax.files.damage import UNREADABLE
+from clothjax.files.storage import save_body
 from clothjax.types import Body
 from data_prep.program import run
 

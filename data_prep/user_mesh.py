@@ -16,8 +16,10 @@ from clothjax.files.storage import FACTORS
 from clothjax.geometry.topology import boundary_loops, components
 from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
+from data_prep import mesh_file
 from data_prep.dressing import FOREARM, WINDING, dress, highest_opening, limbs, push_out
 from data_prep.mesh import compact, edge_table
+from data_prep.mesh_file import Mesh
 from data_prep.remesh import resample
 
 Unit = Literal["m", "cm", "mm", "in", "ft"]
@@ -46,15 +48,6 @@ class Answers(NamedTuple):
     flip: bool = False  # the side that faces the body is the outside
     seed: int = 0
     cloth: tuple[str, ...] = ()  # WHAT=DENSITY,STRETCHING,BENDING with WHAT red or object:NAME
-
-
-class Mesh(NamedTuple):
-    """A mesh as it is in the file."""
-
-    vertices: np.ndarray  # [V, 3] in the file's units
-    faces: np.ndarray  # [F, 3]
-    red: np.ndarray  # [V] bool, painted red
-    objects: dict[str, np.ndarray]  # by name, [V] bool
 
 
 class Working(NamedTuple):
@@ -86,7 +79,7 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     Raises:
         ValueError: naming the file, the place in it, and what to do.
     """
-    mesh = read(path)
+    mesh = mesh_file.read(path)
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
     _check_place(path, mesh.vertices, surface, answers)
     working, index = _clean(path, UNITS[answers.units] * mesh.vertices @ TO_Y_UP[answers.up].T, mesh.faces)
@@ -114,54 +107,6 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     hidden = _uncovered_arms(vertices, body, names)
     samples = DIFFUSION_SAMPLES if loose else 0
     return dress(vertices, faces, body, hidden, pinned, samples, answers.seed)._replace(cloth=cloth), log
-
-
-def read(path: str | Path) -> Mesh:
-    """Read a mesh file (.obj, .ply, .off, .stl, .glb), with all of its objects in one mesh.
-
-    Raises:
-        ValueError: if it is no mesh, has no triangles, or has a vertex that is not finite.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    try:
-        scene = trimesh.load_scene(path, process=False, split_objects=True, group_material=False, skip_materials=True)
-        parts = []
-        for node in scene.graph.nodes_geometry:
-            place, name = scene.graph[node]
-            if isinstance(scene.geometry[name], trimesh.Trimesh) and len(scene.geometry[name].faces):
-                parts.append(({node, name}, scene.geometry[name].copy().apply_transform(place)))
-    except Exception as error:  # whatever a reader of a damaged file of some format raises
-        raise ValueError(f"{path}: not a mesh that can be read ({_brief(error)}); export it as .obj or .glb") from error
-    if not parts:
-        raise ValueError(f"{path}: no triangles; export the mesh with its faces")
-    starts = np.cumsum([0, *(len(part.vertices) for _, part in parts)])
-    vertices = np.concatenate([np.asarray(part.vertices, np.float64) for _, part in parts])
-    faces = np.concatenate([np.asarray(part.faces, np.int64) + start for (_, part), start in zip(parts, starts)])
-    infinite = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if len(infinite):
-        raise ValueError(f"{path}: vertex {infinite[0] + 1} of {len(vertices)} is not finite: {vertices[infinite[0]]}")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"{path}: a face names vertex {faces.max() + 1} of {len(vertices)}")
-    objects = {name: np.zeros(len(vertices), bool) for names, _ in parts for name in names}
-    for (names, part), start in zip(parts, starts):
-        for name in names:
-            objects[name][np.asarray(part.faces) + start] = True
-    return Mesh(vertices, faces, np.concatenate([_red(part) for _, part in parts]), objects)
-
-
-def _brief(error: Exception) -> str:
-    """Return the first line of an error, shortened."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]
-
-
-def _red(part: trimesh.Trimesh) -> np.ndarray:
-    """Return which vertices [V] bool are painted red."""
-    if part.visual.kind != "vertex":
-        return np.zeros(len(part.vertices), bool)
-    red, green, blue = np.asarray(part.visual.vertex_colors)[:, :3].astype(int).T
-    return (red > 150) & (green < 100) & (blue < 100)
 
 
 def _check_place(path: str | Path, vertices: np.ndarray, surface: Surface, answers: Answers) -> None:

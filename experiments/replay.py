@@ -114,7 +114,7 @@ def _again(
         state = fine_tuning.init(student.predictor, experiment.scene, clips, experiment.config)
     elif config.peer.network:
         animator = animators.baseline_animator(input_joints)
-        state = stage1.init_peer(
+        state = stage1.init_baseline(
             experiment.scene, clips, input_joints, laplacian_shapes.laplacian(experiment.scene, config), config
         )
     else:
@@ -122,7 +122,7 @@ def _again(
 
     @partial(jax.jit, static_argnums=2)
     def starting(state: stage1.TrainingState, clips: Clips, frames: int):
-        return stage1.turn(state, experiment.scene, clips, frames, config)
+        return stage1.next_batch(state, experiment.scene, clips, frames, config)
 
     update = stage1.make_curriculum(experiment.scene, clips, config, 1, None, animator)
     return update, lambda state: starting(state, clips, stage1.rollout_length(int(state.step), config)), state

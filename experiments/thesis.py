@@ -32,8 +32,8 @@ from clothjax.evaluation.report import evaluate
 from clothjax.evaluation.rollouts import Tracks, load_run
 from clothjax.files import checkpoint, configuration, storage
 from clothjax.render import ray_cast
-from clothjax.runtime import inference, trained
-from clothjax.runtime.inference import Bounds, Model
+from clothjax.runtime import inference, models, trained
+from clothjax.runtime.models import Bounds, Model
 from clothjax.simulation import assembly
 from clothjax.training.pipeline import train
 from clothjax.types import Pose
@@ -77,7 +77,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--no-training", action="store_true", help="only of the runs that are there")
     arguments = parser.parse_args(argv)
     runs = {name: networks(name, arguments.out, not arguments.no_training) for name in arguments.garments}
-    runs = {name: found for name, found in runs.items() if found}
+    runs = {name: of_garment for name, of_garment in runs.items() if of_garment}
     if not runs:
         raise ValueError(
             f"{arguments.out}: no finished run of {', '.join(arguments.garments)}; leave out --no-training"
@@ -96,7 +96,7 @@ def main(argv: list[str]) -> None:
 def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
     """Return finished runs of a garment, by network; train missing ones first."""
     wanted = [key for key in CONFIGS if key != "direct" or name == ABLATION]
-    found = {}
+    runs = {}
     for key in wanted:
         run = folder / name / key
         if training:
@@ -107,8 +107,8 @@ def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
                 print(f"training {run}", flush=True)
                 train(config, run)
         if finished(run):
-            found[key] = run
-    return found
+            runs[key] = run
+    return runs
 
 
 def cloth(name: str, folder: Path) -> str:
@@ -220,7 +220,7 @@ def failure(runs: Runs) -> tuple[dict, Section]:
         return {}, (title, "<p>Needs a run of ours.</p>")
     run = runs[garment]["ours"]
     experiment, _ = load_run(run)
-    model = inference.load(run, betas=assembly.betas(experiment.config))
+    model = models.load(run, betas=assembly.betas(experiment.config))
     everywhere = Bounds(*(jnp.full_like(model.network.first, x) for x in (-1e9, 1e9, 0.0)))
     free = dataclasses.replace(model, network=model.network._replace(code_bounds=everywhere))
     motion = experiment.config.evaluation.motions[0]
@@ -273,14 +273,14 @@ def _recovery(values: np.ndarray) -> int | None:
 
 def broken(model: Model, poses: Pose, deviations: float) -> np.ndarray:
     """Return vertices [T, V, 3] m in the world over a clip, with the code of one frame moved that far; 0 for not."""
-    state, found = inference.initial_state(model, jax.tree.map(lambda x: x[0], poses)), []
+    state, frames = inference.initial_state(model, jax.tree.map(lambda x: x[0], poses)), []
     wrong = deviations * jax.random.normal(jax.random.key(0), state.latent.shape)
     for frame in range(min(len(poses.translation), BROKEN + AFTER)):
         if frame == BROKEN and deviations > 0:
             state = state._replace(latent=wrong)
         state, vertices = inference.step(model, state, jax.tree.map(lambda x, t=frame: x[t], poses))
-        found.append(np.asarray(vertices))
-    return np.stack(found)
+        frames.append(np.asarray(vertices))
+    return np.stack(frames)
 
 
 def times(runs: Runs) -> tuple[dict, Section]:

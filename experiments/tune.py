@@ -27,11 +27,11 @@ def main(argv: list[str]) -> None:
     parser = cli.Parser("experiments.tune", __doc__, settings=True)
     cli.model_argument(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder to leave it in")
-    given, settings = parser.parse_known_args(argv)
-    folder = cli.model_folder(given.model)
+    arguments, settings = parser.parse_known_args(argv)
+    folder = cli.model_folder(arguments.model)
     if not trained.packed(folder):
         raise ValueError(f"{folder}: not a packed model; train a run further with `python -m clothjax train`")
-    config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(given.out)])
+    config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(arguments.out)])
     if config.tuning.steps < 1:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)
@@ -41,15 +41,15 @@ def main(argv: list[str]) -> None:
     input_joints = psi.input_joints(experiment.names, config.stage2)
     seen = stage2.ordinary_poses(experiment.scene, clips, input_joints, config)
     normalizers = source.normalizers._replace(pose=normalisation.widened(source.normalizers.pose, seen))
-    run = pipeline.Run(experiment, given.out, clips, None)
+    run = pipeline.Run(experiment, arguments.out, clips, None)
     tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(source.garment, source.predictor, normalizers))
-    size = trained.write(given.out, config, phi, jax.device_get(tuned.state.average), normalizers)
+    size = trained.write(arguments.out, config, phi, jax.device_get(tuned.state.average), normalizers)
     about = trained.provenance(folder)
     command = shlex.join(["python", "-m", "experiments.tune", *argv])
     about["command"] = f"{about['command']} && {command}" if "command" in about else command
     about["hours"] = about.get("hours", 0.0) + (tuned.seconds + tuned.compile_seconds) / 3600
-    (given.out / trained.REPORT).write_text(json.dumps(about, indent=1) + "\n")
-    print(f"{given.out}: {size / 1e6:.2f} MB of weights")
+    (arguments.out / trained.REPORT).write_text(json.dumps(about, indent=1) + "\n")
+    print(f"{arguments.out}: {size / 1e6:.2f} MB of weights")
 
 
 if __name__ == "__main__":

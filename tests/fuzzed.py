@@ -26,7 +26,7 @@ def readers() -> dict:
     from clothjax.config import Config
     from clothjax.files import checkpoint, configuration, storage
     from clothjax.runtime import trained
-    from data_prep import amass, asf_amc, bvh, smpl, user_mesh
+    from data_prep import amass, asf_amc, bvh, mesh_file, smpl
 
     return {
         "body.h5": storage.load_body,
@@ -39,11 +39,11 @@ def readers() -> dict:
         "bones.asf": asf_amc.read_asf,
         "take.amc": lambda path: asf_amc.read_amc(path, asf_amc.read_asf(path.parent / "whole.asf")),
         "config.yaml": lambda path: configuration.load(Config, path),
-        "mesh.obj": user_mesh.read,
-        "mesh.ply": user_mesh.read,
-        "mesh.stl": user_mesh.read,
-        "mesh.off": user_mesh.read,
-        "mesh.glb": user_mesh.read,
+        "mesh.obj": mesh_file.read,
+        "mesh.ply": mesh_file.read,
+        "mesh.stl": mesh_file.read,
+        "mesh.off": mesh_file.read,
+        "mesh.glb": mesh_file.read,
         "model.npz": lambda path: trained.psi(path.parent),
         "checkpoint": lambda path: checkpoint.read(path, "params"),
     }

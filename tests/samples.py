@@ -22,7 +22,7 @@ from clothjax.networks import decoder, psi
 from clothjax.networks.normalisation import Normalizers, Scale
 from clothjax.physics import energies
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.runtime import inference
+from clothjax.runtime import inference, models
 from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes
 from clothjax.types import Body, Contact, EdgeContact, Garment, Material, Motion, SelfContact
@@ -307,11 +307,11 @@ def random_model(skip, excluded=()):
         config,
         stage2=dataclasses.replace(config.stage2, excluded_joints=unseen),
     )
-    whole = assembly.assemble(config)
+    experiment = assembly.assemble(config)
     rng = np.random.default_rng(0)
-    kept = psi.input_joints(whole.names, config.stage2)
+    kept = psi.input_joints(experiment.names, config.stage2)
     count, constants = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1), 14
-    basis = 0.3 * laplacian_shapes.laplacian(whole.scene, config)
+    basis = 0.3 * laplacian_shapes.laplacian(experiment.scene, config)
     garment = decoder.init(jax.random.key(0), LATENT, basis, config.model)
     last = garment["decoder"]["dense_1"]
     last |= {"kernel": 50 * last["kernel"], "bias": jnp.asarray(rng.normal(size=last["bias"].shape), jnp.float32)}
@@ -323,8 +323,15 @@ def random_model(skip, excluded=()):
         return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
 
     normalizers = Normalizers(scale(LATENT, -20, 1.0), scale(count, -1e3, 0.5))
-    return inference.build(
-        config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=np.ones(10)
+    return models.build(
+        config,
+        experiment.garment,
+        experiment.body,
+        experiment.names,
+        garment,
+        predictor,
+        normalizers,
+        betas=np.ones(10),
     )
 
 

@@ -63,18 +63,18 @@ def untrained_psi(config: Config):
     from clothjax.material import configured_material
     from clothjax.networks import decoder, phi, psi
     from clothjax.networks.normalisation import Normalizers, Scale
-    from clothjax.simulation import assembly as experiment
-    from clothjax.training import laplacian_shapes as blendshapes
+    from clothjax.simulation import assembly
+    from clothjax.training import laplacian_shapes
 
     config = dataclasses.replace(config, motions=("walk_0",), model=dataclasses.replace(config.model, latent=9))
-    whole = experiment.assemble(config)
-    reel = jax.tree.map(jnp.asarray, experiment.training_clips(whole)[0])
-    left, channels = phi.latent_size(whole.scene, config.model)
+    experiment = assembly.assemble(config)
+    reel = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
+    left, channels = phi.latent_size(experiment.scene, config.model)
     size = left * channels
-    kept = psi.input_joints(whole.names, config.stage2)
+    kept = psi.input_joints(experiment.names, config.stage2)
     count = 6 + 3 * 6 * len(kept) + 9 * (len(kept) - 1)
     constants = psi.constant_inputs(jnp.zeros(10), configured_material(config), config.material)
-    shapes = 0.1 * blendshapes.laplacian(whole.scene, config)
+    shapes = 0.1 * laplacian_shapes.laplacian(experiment.scene, config)
     garment = decoder.init(jax.random.key(0), size, shapes, config.model)
     predictor = psi.init(jax.random.key(1), size, count, len(constants), config.stage2)
     rng = np.random.default_rng(0)
@@ -84,4 +84,4 @@ def untrained_psi(config: Config):
         return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
 
     # codes of an untrained network stay near zero: some of them are out of so narrow a range
-    return whole, reel, kept, garment, predictor, Normalizers(scale(size, 0.1), scale(count, 1e6))
+    return experiment, reel, kept, garment, predictor, Normalizers(scale(size, 0.1), scale(count, 1e6))

@@ -25,8 +25,8 @@ from clothjax import cli
 from clothjax.export import formats
 from clothjax.export.formats import FORMATS, Options
 from clothjax.files import storage
-from clothjax.runtime import inference, trained
-from clothjax.runtime.inference import Model
+from clothjax.runtime import models, trained
+from clothjax.runtime.models import Model
 from clothjax.simulation import assembly
 from clothjax.types import Material, Motion
 
@@ -61,12 +61,12 @@ def main(argv: list[str]) -> None:
             raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
     material = None if arguments.material is None else Material(*arguments.material)
-    model = inference.load(run, betas=betas, material=material)
+    model = models.load(run, betas=betas, material=material)
     form = FORMATS[arguments.to]
     shipped = arguments.model in trained.shipped()
     out = arguments.out or (Path(".") if shipped else run) / f"{model.config.garment}.{form.suffix}"
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
-    error = formats.export(model, arguments.to, out, options, about, _validation(model))
+    error = formats.export(model, arguments.to, out, options, about, validation(model))
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
     if error is None:
         print(f"not compared: {form.not_run}")
@@ -82,7 +82,7 @@ def _batch(given: str) -> int | None:
     return None if given == "dynamic" else int(given)
 
 
-def _validation(model: Model) -> Motion:
+def validation(model: Model) -> Motion:
     """Return the first validation motion that is present, for FRAMES frames."""
     names = [name for name in model.config.evaluation.motions if storage.asset(name).is_file()]
     clip = storage.load_motion(names[0] if names else "walk_3", model.names)

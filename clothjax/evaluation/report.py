@@ -25,7 +25,7 @@ from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
-from clothjax.runtime import inference, trained
+from clothjax.runtime import models, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
@@ -135,7 +135,7 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         return lambda: np.asarray(compiled(model, character, poses))
 
     def psi(character: Character, clip: Motion):
-        loaded = inference.load(run, betas=np.asarray(character.betas), material=character.material)
+        loaded = models.load(run, betas=np.asarray(character.betas), material=character.material)
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)
 

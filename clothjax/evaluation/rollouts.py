@@ -13,6 +13,7 @@ from clothjax.body import motion_clips
 from clothjax.config import EvaluationConfig
 from clothjax.networks.animators import MakeAnimator, phi_animator
 from clothjax.runtime import inference, trained
+from clothjax.runtime.models import Model
 from clothjax.simulation import assembly, characters, rollout
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
@@ -89,7 +90,7 @@ def phi_trajectory(experiment: Experiment, phi: dict, character: Character, pose
     return np.asarray(play(phi, poses))
 
 
-def psi_trajectory(psi: inference.Model, clip: Motion) -> np.ndarray:
+def psi_trajectory(psi: Model, clip: Motion) -> np.ndarray:
     """Roll Psi out on a clip of T frames: return the garment [T - 2, V, 3] m at the same frames as `windows` has.
 
     It is relative to the root, as the other trajectories are.

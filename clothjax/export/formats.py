@@ -11,7 +11,7 @@ import numpy as np
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.inference import Model
+from clothjax.runtime.models import Model
 from clothjax.types import Motion
 
 

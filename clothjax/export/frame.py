@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 
 from clothjax.runtime import inference
-from clothjax.runtime.inference import Model, State
+from clothjax.runtime.models import Model, State
 from clothjax.types import Pose
 
 ARGUMENTS = (

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from clothjax.export import sidecar
-from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model
+from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model
 from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))

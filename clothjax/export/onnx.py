@@ -11,7 +11,7 @@ from clothjax.export import sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.inference import FoldedLayer, Layer, Model
+from clothjax.runtime.models import FoldedLayer, Layer, Model
 from clothjax.types import Array, Motion, Pose
 
 INPUTS = ("latent", "history", "rotations", "translation")

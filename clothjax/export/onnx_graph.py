@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax.runtime.inference import Layer
+from clothjax.runtime.models import Layer
 from clothjax.runtime.specialise import smoothing_scale
 from clothjax.types import Array
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from clothjax.export import native
-from clothjax.runtime.inference import Model, State
+from clothjax.runtime.models import Model, State
 from clothjax.types import Array, Pose
 
 SOURCE = Path(__file__).with_name("psi_ffi.cc")

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import Config
-from clothjax.files import configuration, storage
-from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model, Network, Wearer
+from clothjax.files import configuration, damage
+from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model, Network, Wearer
 
 FORMAT = 1  # of the file; readers refuse a newer one
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
@@ -44,7 +44,7 @@ def from_safetensors(path: str | Path) -> Model:
         with library.safe_open(str(path), framework="numpy") as file:
             about = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
             arrays = {name: jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())}  # not a dict
-        storage.refuse_newer(path, about.get("format", 1), FORMAT)
+        damage.refuse_newer(path, about.get("format", 1), FORMAT)
         config = configuration.from_dict(Config, about["config"], str(path))
         static = {field: tuple(about[name]) for name, field in STATIC.items()}
 
@@ -73,7 +73,7 @@ def from_safetensors(path: str | Path) -> Model:
         )
         wearer = Wearer(*(arrays[f"wearer.{field}"] for field in Wearer._fields))
         return Model(network=network, wearer=wearer, faces=arrays["faces"], config=config, **static)
-    except storage.NewerFormat:
+    except damage.NewerFormat:
         raise
     except (library.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(f"{path}: not a whole model in safetensors ({error}); convert it again") from error

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from clothjax.runtime.inference import Model
+from clothjax.runtime.models import Model
 
 Output = Literal["world", "canonical", "none"]
 VERTICES = {

@@ -11,7 +11,7 @@ import numpy as np
 
 from clothjax.export import frame, sidecar
 from clothjax.runtime import inference
-from clothjax.runtime.inference import Model
+from clothjax.runtime.models import Model
 from clothjax.types import Motion, Pose
 
 RUN = """

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from clothjax.files import damage
+
 FORMAT = 1
 """Version of the format; readers refuse a newer one."""
 
@@ -94,36 +96,28 @@ def latest(directory: str | Path) -> Checkpoint:
     Raises:
         ValueError: if there is none, or a newer version of this library wrote it.
     """
-    return _newest(Path(directory).resolve(), None, _about)
+    return _newest(Path(directory).resolve(), _about)
 
 
-def restore(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
+def restore(directory: str | Path, like: Tree) -> tuple[Tree, Checkpoint]:
     """Read the complete state of the newest undamaged checkpoint, bit for bit; warn of damaged ones.
 
     Args:
         directory: of all checkpoints of a run.
         like: a state of the expected structure, shapes, dtypes and sharding: arrays or `jax.ShapeDtypeStruct`s.
-        step: of one checkpoint, instead of the newest.
 
     Raises:
         ValueError: if there is no undamaged checkpoint, or a leaf is missing, left over or of another shape.
     """
-    return _restore(Path(directory).resolve(), like, step, whole=True)
+    wanted = named(like)
 
+    def read_one(path: Path) -> tuple[Tree, Checkpoint]:
+        checkpoint = _about(path)
+        _check(checkpoint, wanted)
+        leaves = _leaves(checkpoint, wanted)
+        return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in wanted]), checkpoint
 
-def restore_parts(directory: str | Path, like: Tree, *, step: int | None = None) -> tuple[Tree, Checkpoint]:
-    """Read only the parts of the state that `like` names, otherwise as `restore`.
-
-    Args:
-        directory: of all checkpoints of a run.
-        like: a dictionary from some of the state's keys or fields to trees as in `restore`, such as
-            `{"params": ..., "statistics": ...}`.
-        step: of one checkpoint, instead of the newest.
-
-    Raises:
-        ValueError: if there is no undamaged checkpoint, or a leaf is missing or of another shape.
-    """
-    return _restore(Path(directory).resolve(), like, step, whole=False)
+    return _newest(Path(directory).resolve(), read_one)
 
 
 def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint]:
@@ -151,7 +145,7 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
         leaves = _leaves(about, named(like))
         return jax.tree.unflatten(jax.tree.structure(like), leaves.values()), about
 
-    return _newest(Path(directory).resolve(), None, read_one)
+    return _newest(Path(directory).resolve(), read_one)
 
 
 def set_aside(directory: str | Path, after: int) -> None:
@@ -198,20 +192,18 @@ def _checksum(array: jax.Array) -> int | None:
     return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
 
 
-def _newest(directory: Path, step: int | None, read: Callable[[Path], T]) -> T:
+def _newest(directory: Path, read: Callable[[Path], T]) -> T:
     """Call `read` on the newest checkpoint that is not damaged."""
     existing = steps(directory)
     if not existing:
         why = "holds no checkpoints (folders named by a step)" if directory.is_dir() else "does not exist"
         raise ValueError(f"{directory}: {why}; train first, or give the folder of another run")
-    if step is not None and step not in existing:
-        raise ValueError(f"{directory}: no checkpoint of step {step}; there are {existing}")
-    for number in reversed(existing if step is None else [step]):
+    for number in reversed(existing):
         try:
             return read(directory / str(number))
-        except _Damaged as damage:
-            reason = f"{directory / str(number)} is damaged ({damage})"
-            warnings.warn(f"{reason}; looking for an older checkpoint", stacklevel=4)
+        except _Damaged as error:
+            reason = f"{directory / str(number)} is damaged ({error})"
+            warnings.warn(f"{reason}; looking for an older checkpoint", stacklevel=3)
     raise ValueError(f"{directory}: no undamaged checkpoint: {reason}")
 
 
@@ -224,25 +216,11 @@ def _about(path: Path) -> Checkpoint:
         checkpoint = Checkpoint(path, about["step"], about["config"], about["description"], about["leaves"])
     except Exception as error:  # Orbax raises many kinds for broken files; the message has the reason
         raise _Damaged(f"its description cannot be read: {_first_line(error)}") from error
-    if version > FORMAT:
-        raise ValueError(f"{path}: has format {version}, this version of clothjax reads up to {FORMAT}; update it")
+    damage.refuse_newer(path, version, FORMAT)
     return checkpoint
 
 
-def _restore(directory: Path, like: Tree, step: int | None, *, whole: bool) -> tuple[Tree, Checkpoint]:
-    """Read the leaves of `like`; with `whole`, refuse a checkpoint that has others."""
-    wanted = named(like)
-
-    def read(path: Path) -> tuple[Tree, Checkpoint]:
-        checkpoint = _about(path)
-        _check(checkpoint, wanted, whole)
-        leaves = _leaves(checkpoint, wanted)
-        return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in wanted]), checkpoint
-
-    return _newest(directory, step, read)
-
-
-def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
+def _check(checkpoint: Checkpoint, wanted: dict[str, Any]) -> None:
     """Raise a ValueError if names, shapes or dtypes differ. Orbax's partial restore accepts this silently."""
     hint = "another garment, other model sizes or another version of the model"
     for name, leaf in wanted.items():
@@ -254,7 +232,7 @@ def _check(checkpoint: Checkpoint, wanted: dict[str, Any], whole: bool) -> None:
                 f"{checkpoint.path}: {name} is {stored['dtype']}{stored['shape']}, "
                 f"this model needs {leaf.dtype}{list(leaf.shape)}: {hint}"
             )
-    left_over = sorted(set(checkpoint.leaves) - set(wanted)) if whole else []
+    left_over = sorted(set(checkpoint.leaves) - set(wanted))
     if left_over:
         raise ValueError(f"{checkpoint.path}: holds {', '.join(left_over[:5])}, which this model has not: {hint}")
 

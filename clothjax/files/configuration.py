@@ -15,7 +15,6 @@ import yaml
 from clothjax.config import ANYTHING
 
 Config = TypeVar("Config")
-Sources = dict[str, tuple[str, ...]]  # dotted path of a value -> the files that set it or parts of it
 
 
 def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> Config:
@@ -34,9 +33,9 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
             wrong type or one that `__post_init__` refuses. The message has the file and the dotted path.
         SystemExit: for a mistake in `overrides`, after a message, or for `--help`.
     """
+    reader = _Reader(str(path))
     try:
-        values, sources = _read(Path(path), ())
-        config = _build(cls, values, "", sources, str(path))
+        config = reader.build(cls, reader.read(Path(path), ()), "")
     except RecursionError:
         raise ValueError(f"{path}: a value contains itself (an anchor, `&name`, around its own `*name`)") from None
     return _override(cls, config, overrides, prog=f"... {path}") if overrides else config
@@ -83,7 +82,7 @@ def from_dict(cls: type[Config], values: Mapping[str, Any], source: str = "confi
     Raises:
         ValueError: as `load`.
     """
-    return _build(cls, values, "", {}, source)
+    return _Reader(source).build(cls, values, "")
 
 
 def _override(cls: type[Config], config: Config, arguments: Sequence[str], prog: str) -> Config:
@@ -93,34 +92,116 @@ def _override(cls: type[Config], config: Config, arguments: Sequence[str], prog:
     return tyro.cli(cls, default=config, args=list(arguments), prog=prog)
 
 
-def _read(path: Path, children: tuple[Path, ...]) -> tuple[dict, Sources]:
-    """Read the values of a file over those of its parents, and the source file of each."""
-    if path.resolve() in children:
-        chain = " -> ".join(str(p) for p in (*children, path.resolve()))
-        raise ValueError(f"{path}: `extends:` goes round in a circle: {chain}")
-    try:
-        text = path.read_text(encoding="utf-8")
-        _refuse_duplicates(yaml.compose(text, Loader=yaml.SafeLoader), path)
-        values = yaml.safe_load(text)
-    except OSError as error:
-        child = f" (extended by {children[-1]})" if children else ""
-        raise ValueError(f"{path}{child}: cannot be read: {error.strerror or error}") from error
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = f", line {mark.line + 1}" if mark else ""
-        raise ValueError(f"{path}{line}: is not valid YAML: {error.problem or error.context}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: is not valid YAML: {' '.join(str(error).split())}") from error
-    values = {} if values is None else values
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected `key: value` lines at the top, got {values!r}")
-    parent = values.pop("extends", None)
-    if parent is None:
-        return _merge({}, values, "", {}, str(path))
-    if not isinstance(parent, str):
-        raise ValueError(f"{path}: extends: expected the name of one file, got {parent!r}")
-    inherited, sources = _read(path.parent / parent, (*children, path.resolve()))
-    return _merge(inherited, values, "", sources, str(path))
+class _Reader:
+    """Reads the values of YAML files and builds dataclasses of them; its errors name the files that set a value."""
+
+    def __init__(self, default: str):
+        self.default = default  # the source of a value that no file set
+        self.sources: dict[str, tuple[str, ...]] = {}  # dotted path of a value -> the files that set it or parts of it
+
+    def read(self, path: Path, children: tuple[Path, ...]) -> dict:
+        """Return the values of a file over those of its parents."""
+        if path.resolve() in children:
+            chain = " -> ".join(str(p) for p in (*children, path.resolve()))
+            raise ValueError(f"{path}: `extends:` goes round in a circle: {chain}")
+        try:
+            text = path.read_text(encoding="utf-8")
+            _refuse_duplicates(yaml.compose(text, Loader=yaml.SafeLoader), path)
+            values = yaml.safe_load(text)
+        except OSError as error:
+            child = f" (extended by {children[-1]})" if children else ""
+            raise ValueError(f"{path}{child}: cannot be read: {error.strerror or error}") from error
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            line = f", line {mark.line + 1}" if mark else ""
+            raise ValueError(f"{path}{line}: is not valid YAML: {error.problem or error.context}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}: is not valid YAML: {' '.join(str(error).split())}") from error
+        values = {} if values is None else values
+        if not isinstance(values, dict):
+            raise ValueError(f"{path}: expected `key: value` lines at the top, got {values!r}")
+        parent = values.pop("extends", None)
+        if not isinstance(parent, str | None):
+            raise ValueError(f"{path}: extends: expected the name of one file, got {parent!r}")
+        inherited = {} if parent is None else self.read(path.parent / parent, (*children, path.resolve()))
+        return self.merge(inherited, values, "", str(path))
+
+    def merge(self, old: dict, new: dict, prefix: str, source: str) -> dict:
+        """Merge the values `new` of the file `source` over `old`, key by key."""
+        merged = dict(old)
+        for key, value in new.items():
+            path, inherited = _join(prefix, key), merged.get(key)
+            shared = isinstance(value, dict) and isinstance(inherited, dict)
+            self.sources[path] = (*(self.sources.get(path, ()) if shared else ()), source)
+            if isinstance(value, dict):
+                value = self.merge(inherited if shared else {}, value, path, source)
+            merged[key] = value
+        return merged
+
+    def fail(self, message: str, path: str) -> typing.NoReturn:
+        """Raise a ValueError that names the dotted path and the files that set the value there."""
+        known = path.partition("[")[0]  # an element of a list comes from where the list does
+        while known and known not in self.sources:
+            known = known.rpartition(".")[0]
+        where = ", ".join(self.sources.get(known, (self.default,)))
+        raise ValueError(f"{where}: {path}: {message}" if path else f"{where}: {message}")
+
+    def build(self, cls: type, values: Any, path: str) -> Any:
+        """Build the dataclass `cls` from the mapping at `path`."""
+        if not isinstance(values, Mapping):
+            self.fail(f"expected a mapping of settings, got {values!r}", path)
+        fields = {f.name: f for f in dataclasses.fields(cls)}
+        retired = getattr(cls, "RETIRED", {})
+        for key in set(values) & set(retired):
+            if retired[key] is not ANYTHING and values[key] != retired[key]:
+                self.fail(f"is no longer a setting, it is always {retired[key]!r}", _join(path, key))
+        values = {key: value for key, value in values.items() if key not in retired}
+        for key in values:
+            if key not in fields:
+                near = difflib.get_close_matches(str(key), fields, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(fields))}"
+                self.fail(f"unknown key; {hint}", _join(path, key))
+        for name, field in fields.items():
+            required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            if required and name not in values:
+                self.fail("is required and missing", _join(path, name))
+        hints = typing.get_type_hints(cls)
+        arguments = {key: self.coerce(hints[key], v, _join(path, key)) for key, v in values.items()}
+        try:
+            return cls(**arguments)
+        except ValueError as error:  # of __post_init__: these keys belong together, so the whole mapping is named
+            self.fail(str(error), path)
+
+    def coerce(self, hint: Any, value: Any, path: str) -> Any:
+        """Convert `value` to the declared type, or raise a ValueError."""
+        origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            return self.build(hint, value, path)
+        if origin in (typing.Union, types.UnionType):
+            (inner,) = (a for a in arguments if a is not type(None))  # Optional is the only union that fields use
+            return None if value is None else self.coerce(inner, value, path)
+        if origin is typing.Literal:
+            if not any(value == a and type(value) is type(a) for a in arguments):
+                self.fail(f"{value!r} is not one of {', '.join(map(repr, arguments))}", path)
+            return value
+        if origin is tuple:
+            if not isinstance(value, list | tuple):
+                self.fail(f"expected a list, got {value!r}", path)
+            if len(arguments) == 2 and arguments[1] is Ellipsis:
+                arguments = (arguments[0],) * len(value)
+            if len(arguments) != len(value):
+                self.fail(f"expected {len(arguments)} values, got {len(value)}: {value!r}", path)
+            pairs = enumerate(zip(arguments, value, strict=True))
+            return tuple(self.coerce(a, v, f"{path}[{i}]") for i, (a, v) in pairs)
+        if origin is dict:
+            if not isinstance(value, Mapping):
+                self.fail(f"expected a mapping, got {value!r}", path)
+            return {str(k): self.coerce(arguments[1], v, _join(path, k)) for k, v in value.items()}
+        scalar = _scalar(hint, value)
+        if scalar is None:
+            advice = "; put text in quotes" if hint is str else ""
+            self.fail(f"expected {hint.__name__}, got {value!r} ({type(value).__name__}){advice}", path)
+        return scalar
 
 
 def _refuse_duplicates(node: yaml.Node | None, path: Path) -> None:
@@ -139,100 +220,8 @@ def _refuse_duplicates(node: yaml.Node | None, path: Path) -> None:
             _refuse_duplicates(child, path)
 
 
-def _merge(old: dict, new: dict, prefix: str, sources: Sources, source: str) -> tuple[dict, Sources]:
-    """Merge the values `new` of the file `source` over `old`, key by key."""
-    merged = dict(old)
-    for key, value in new.items():
-        path = _join(prefix, key)
-        inherited = merged.get(key)
-        if isinstance(value, dict):
-            shared = isinstance(inherited, dict)
-            sources = sources | {path: (*(sources.get(path, ()) if shared else ()), source)}
-            merged[key], sources = _merge(inherited if shared else {}, value, path, sources, source)
-        else:
-            merged[key], sources = value, sources | {path: (source,)}
-    return merged, sources
-
-
 def _join(prefix: str, key: Any) -> str:
     return f"{prefix}.{key}" if prefix else str(key)
-
-
-def _fail(message: str, path: str, sources: Sources, default: str) -> typing.NoReturn:
-    """Raise a ValueError that names the dotted path and the files that set the value there."""
-    known = path.partition("[")[0]  # an element of a list comes from where the list does
-    while known and known not in sources:
-        known = known.rpartition(".")[0]
-    where = ", ".join(sources.get(known, (default,)))
-    raise ValueError(f"{where}: {path}: {message}" if path else f"{where}: {message}")
-
-
-def _build(cls: type, values: Any, path: str, sources: Sources, default: str) -> Any:
-    """Build the dataclass `cls` from the mapping at `path`."""
-    if not isinstance(values, Mapping):
-        _fail(f"expected a mapping of settings, got {values!r}", path, sources, default)
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    retired = getattr(cls, "RETIRED", {})
-    for key in set(values) & set(retired):
-        if retired[key] is not ANYTHING and values[key] != retired[key]:
-            _fail(f"is no longer a setting, it is always {retired[key]!r}", _join(path, key), sources, default)
-    values = {key: value for key, value in values.items() if key not in retired}
-    for key in values:
-        if key not in fields:
-            near = difflib.get_close_matches(str(key), fields, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"valid keys: {', '.join(sorted(fields))}"
-            _fail(f"unknown key; {hint}", _join(path, key), sources, default)
-    for name, field in fields.items():
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and name not in values:
-            _fail("is required and missing", _join(path, name), sources, default)
-    hints = typing.get_type_hints(cls)
-    arguments = {key: _coerce(hints[key], v, _join(path, key), sources, default) for key, v in values.items()}
-    try:
-        return cls(**arguments)
-    except ValueError as error:  # of __post_init__: these keys belong together, so the whole mapping is named
-        _fail(str(error), path, sources, default)
-
-
-def _coerce(hint: Any, value: Any, path: str, sources: Sources, default: str) -> Any:
-    """Convert `value` to the declared type, or raise a ValueError."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        return _build(hint, value, path, sources, default)
-    if origin in (typing.Union, types.UnionType):
-        (inner,) = (a for a in arguments if a is not type(None))  # Optional is the only union that fields use
-        return None if value is None else _coerce(inner, value, path, sources, default)
-    if origin is typing.Literal:
-        if not any(value == a and type(value) is type(a) for a in arguments):
-            _fail(f"{value!r} is not one of {', '.join(map(repr, arguments))}", path, sources, default)
-        return value
-    if origin is tuple:
-        return _coerce_tuple(arguments, value, path, sources, default)
-    if origin is dict:
-        if not isinstance(value, Mapping):
-            _fail(f"expected a mapping, got {value!r}", path, sources, default)
-        return {str(k): _coerce(arguments[1], v, _join(path, k), sources, default) for k, v in value.items()}
-    scalar = _scalar(hint, value)
-    if scalar is None:
-        hint_text = "; put text in quotes" if hint is str else ""
-        _fail(
-            f"expected {hint.__name__}, got {value!r} ({type(value).__name__}){hint_text}",
-            path,
-            sources,
-            default,
-        )
-    return scalar
-
-
-def _coerce_tuple(arguments: tuple, value: Any, path: str, sources: Sources, default: str) -> tuple:
-    if not isinstance(value, list | tuple):
-        _fail(f"expected a list, got {value!r}", path, sources, default)
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        arguments = (arguments[0],) * len(value)
-    if len(arguments) != len(value):
-        _fail(f"expected {len(arguments)} values, got {len(value)}: {value!r}", path, sources, default)
-    pairs = enumerate(zip(arguments, value, strict=True))
-    return tuple(_coerce(a, v, f"{path}[{i}]", sources, default) for i, (a, v) in pairs)
 
 
 def _scalar(kind: type, value: Any) -> bool | int | float | str | None:

@@ -21,29 +21,18 @@ Motion, `format` "clothjax/motion", attribute `fps` float64:
 Readers accept any `format` that ends in /body, /garment or /motion, and ignore further datasets.
 """
 
-import os
-import struct
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import h5py
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from clothjax.files import hdf5
+from clothjax.files.hdf5 import Reader
 from clothjax.types import Array, Body, Garment, Motion
 
-VERSION = 1
-# exceptions that readers of files raise for damaged files or files of another kind
-UNREADABLE = (
-    ValueError, LookupError, TypeError, AttributeError, OSError, EOFError, RuntimeError, ArithmeticError, MemoryError,
-    SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
 ASSETS = Path(__file__).parents[1] / "assets"
 FACTORS = (0.01, 100.0)  # allowed range of the factors of a garment's cloth
 
@@ -53,23 +42,6 @@ class Rig(NamedTuple):
 
     body: Body
     names: tuple[str, ...]  # [J]
-
-
-class NewerFormat(ValueError):
-    """A file was written by a newer version of this library."""
-
-
-def refuse_newer(path: str | Path, version: int, known: int) -> None:
-    """Refuse a file that a newer version of this library wrote.
-
-    Args:
-        version, known: numbers of the file's format, and of the newest that is known here.
-
-    Raises:
-        NewerFormat: if `version` is the larger.
-    """
-    if version > known:
-        raise NewerFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")
 
 
 # Names
@@ -116,26 +88,25 @@ def load_rig(path: str | Path) -> Rig:
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
     """
-    with _open(path, "body") as file:
-        sizes: dict[str, int] = {}
-        vertices = _floats(file, "vertices", ("B", 3), sizes)
-        joints = _floats(file, "joints", ("J", 3), sizes)
-        parents = _integers(file, "parents", ("J",), sizes, -1, sizes["J"])
+    with hdf5.reading(asset(path), "body") as file:
+        vertices = file.floats("vertices", ("B", 3))
+        joints = file.floats("joints", ("J", 3))
+        parents = file.integers("parents", ("J",), -1, file.sizes["J"])
         _check_parents(file, parents)
         _check_size(file, "body height", np.ptp(vertices[:, 1]), 0.3, 3.0)
         body = Body(
             vertices=vertices,
-            faces=_faces(file, ("Fb", 3), sizes, sizes["B"]),
+            faces=_faces(file, "Fb", "B"),
             joints=joints,
             parents=parents,
-            weights=_weights(file, "B", sizes),
-            shapedirs=_floats(file, "shapedirs", ("B", 3, "S"), sizes),
-            joint_shapedirs=_floats(file, "joint_shapedirs", ("J", 3, "S"), sizes),
+            weights=_weights(file, "B"),
+            shapedirs=file.floats("shapedirs", ("B", 3, "S")),
+            joint_shapedirs=file.floats("joint_shapedirs", ("J", 3, "S")),
         )
         if "posedirs" in file:
-            shape = ("B", 3, 9 * (sizes["J"] - 1))
-            body = body._replace(posedirs=_floats(file, "posedirs", shape, sizes))
-        return Rig(body, _names(file, sizes))
+            shape = ("B", 3, 9 * (file.sizes["J"] - 1))
+            body = body._replace(posedirs=file.floats("posedirs", shape))
+        return Rig(body, file.texts("joint_names", ("J",)))
 
 
 def load_garment(path: str | Path, body: Body) -> Garment:
@@ -144,28 +115,28 @@ def load_garment(path: str | Path, body: Body) -> Garment:
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry; or if the body is far away.
     """
-    with _open(path, "garment") as file:
-        sizes = {"J": len(body.parents), "S": np.shape(body.shapedirs)[-1]}
-        vertices = _floats(file, "vertices", ("V", 3), sizes)
+    with hdf5.reading(asset(path), "garment") as file:
+        file.sizes.update(J=len(body.parents), S=np.shape(body.shapedirs)[-1])
+        vertices = file.floats("vertices", ("V", 3))
         _check_size(file, "largest extent of the garment", np.ptp(vertices, axis=0).max(), 0.05, 3.0)
         distance = np.median(KDTree(np.asarray(body.vertices)).query(vertices)[0])
         if distance > 0.3:
-            raise ValueError(
-                f"{file.filename}: half of the garment is more than {distance:.2f} m from the body: "
+            file.fail(
+                f"half of the garment is more than {distance:.2f} m from the body: "
                 "it was made for another body or another origin; align the two"
             )
-        faces = _faces(file, ("F", 3), sizes, sizes["V"])
+        faces = _faces(file, "F", "V")
         _check_sides(file, faces)
-        loose = np.setdiff1d(np.arange(sizes["V"]), faces)
+        loose = np.setdiff1d(np.arange(file.sizes["V"]), faces)
         if len(loose):
-            raise ValueError(f"{file.filename}: vertex {loose[0]} has no face ({len(loose)} such): remove it")
+            file.fail(f"vertex {loose[0]} has no face ({len(loose)} such): remove it")
         return Garment(
             vertices=vertices,
             faces=faces,
-            weights=_weights(file, "V", sizes),
-            shapedirs=_floats(file, "shapedirs", ("V", 3, "S"), sizes),
-            pinned=_dataset(file, "pin", ("V",), sizes).astype(bool),
-            cloth=_cloth(file, sizes) if "cloth" in file else None,
+            weights=_weights(file, "V"),
+            shapedirs=file.floats("shapedirs", ("V", 3, "S")),
+            pinned=file.dataset("pin", ("V",)).astype(bool),
+            cloth=_cloth(file) if "cloth" in file else None,
         )
 
 
@@ -179,17 +150,16 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry.
     """
-    with _open(path, "motion") as file:
-        sizes: dict[str, int] = {}
-        poses = _floats(file, "poses", ("T", "J", 3), sizes).astype(np.float64)
-        translation = _floats(file, "trans", ("T", 3), sizes, np.float64)
-        fps = file.attrs.get("fps")
+    with hdf5.reading(asset(path), "motion") as file:
+        poses = file.floats("poses", ("T", "J", 3)).astype(np.float64)
+        translation = file.floats("trans", ("T", 3), np.float64)
+        fps = file.attribute("fps")
         if not isinstance(fps, (int, float, np.number)) or not 0 < fps < np.inf:
-            raise ValueError(f"{file.filename}: attribute 'fps' must be a number > 0, got {fps!r}")
+            file.fail(f"attribute 'fps' must be a number > 0, got {fps!r}")
         if np.median(np.abs(translation[:, 1])) > 20:
             height = np.median(np.abs(translation[:, 1]))
-            raise ValueError(f"{file.filename}: root height {height:.0f} m looks like centimetres: divide by 100")
-        names = _names(file, sizes)
+            file.fail(f"root height {height:.0f} m looks like centimetres: divide by 100")
+        names = file.texts("joint_names", ("J",))
         if joint_names is not None and names != tuple(joint_names):
             _refuse_joints(file, names, tuple(joint_names))
         rotations = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
@@ -202,17 +172,17 @@ def joint_names(path: str | Path) -> tuple[str, ...]:
     Raises:
         ValueError: for a file that is missing or damaged.
     """
-    with _open(path, "") as file:
-        return _names(file, {})
+    with hdf5.reading(asset(path), "") as file:
+        return file.texts("joint_names", ("J",))
 
 
 def canonical_rotation(path: str | Path) -> np.ndarray:
     """Read the rotations [J, 3, 3] of a body's bones from its canonical pose to a T-pose; identity if not stored."""
-    with _open(path, "body") as file:
-        names = _names(file, {})
+    with hdf5.reading(asset(path), "body") as file:
+        names = file.texts("joint_names", ("J",))
         if "canonical_rotation" not in file:
             return np.tile(np.eye(3), (len(names), 1, 1))
-        return _floats(file, "canonical_rotation", (len(names), 3, 3), {}, np.float64)
+        return file.floats("canonical_rotation", (len(names), 3, 3), np.float64)
 
 
 # Writing
@@ -240,7 +210,7 @@ def save_body(
         "faces": np.int32(body.faces),
         "joints": np.float32(body.joints),
         "parents": np.int32(body.parents),
-        "joint_names": _strings(joint_names),
+        "joint_names": hdf5.encoded(joint_names),
         **_sparse(body.weights),
         "shapedirs": np.float32(body.shapedirs),
         "joint_shapedirs": np.float32(body.joint_shapedirs),
@@ -249,7 +219,7 @@ def save_body(
         data["posedirs"] = np.float32(body.posedirs)
     if canonical_rotation is not None:
         data["canonical_rotation"] = np.float32(canonical_rotation)
-    _write(path, "body", data, name=name, source=source, licence=licence)
+    hdf5.write(path, "body", data, name=name, source=source, licence=licence)
 
 
 def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str) -> None:
@@ -268,7 +238,7 @@ def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, so
     }
     if garment.cloth is not None:
         data["cloth"] = np.float32(garment.cloth)
-    _write(path, "garment", data, name=name, body=body, source=source, licence=licence)
+    hdf5.write(path, "garment", data, name=name, body=body, source=source, licence=licence)
 
 
 def save_motion(
@@ -285,91 +255,25 @@ def save_motion(
     data = {
         "poses": np.float32(poses),
         "trans": np.float64(motion.translation),
-        "joint_names": _strings(joint_names),
+        "joint_names": hdf5.encoded(joint_names),
     }
-    _write(path, "motion", data, fps=float(motion.fps), name=name, source=source, licence=licence)
+    hdf5.write(path, "motion", data, fps=float(motion.fps), name=name, source=source, licence=licence)
 
 
-# One dataset at a time
+# Checks
 
 
-@contextmanager
-def _open(path: str | Path, kind: str) -> Iterator[h5py.File]:
-    """Open a file of a kind for reading, and check its attributes."""
-    path = asset(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    try:
-        with h5py.File(path, "r") as file:
-            form = str(_decoded(file.attrs.get("format", "missing")))
-            if kind and form.rpartition("/")[2] != kind:
-                raise ValueError(f"{path}: attribute 'format' is {form!r}, expected 'clothjax/{kind}'")
-            for key, wanted in (("version", VERSION), ("units", "m"), ("up", "+Y")):
-                value = _decoded(file.attrs.get(key, wanted))
-                if value != wanted:
-                    raise ValueError(f"{path}: attribute {key!r} is {value!r}, expected {wanted!r}")
-            yield file
-    except (OSError, RuntimeError, KeyError) as error:  # h5py raises these for a damaged file
-        raise ValueError(f"{path}: not a readable HDF5 file, perhaps cut short ({error})") from error
-
-
-def _dataset(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int]) -> np.ndarray:
-    """Read a dataset of a shape in numbers and letters; a letter new to `sizes` takes the size in the file."""
-    if name not in file:
-        raise ValueError(f"{file.filename}: dataset {name!r} is missing; it has {', '.join(sorted(map(str, file)))}")
-    dataset = file[name]
-    if not isinstance(dataset, h5py.Dataset):
-        raise ValueError(f"{file.filename}: {name!r} is not a dataset but a {type(dataset).__name__}")
-    actual = dataset.shape
-    wanted = tuple(sizes.get(n, n) for n in shape)
-    if actual[:1] == (0,):
-        what = {"T": "frames", "J": "joints"}.get(shape[0], "rows")
-        raise ValueError(f"{file.filename}: dataset {name!r} is empty, there are no {what} in it")
-    if len(actual) != len(wanted) or any(isinstance(w, int) and w != n for n, w in zip(actual, wanted, strict=True)):
-        text = ", ".join(f"{n} = {sizes[n]}" if n in sizes else str(n) for n in shape)
-        raise ValueError(f"{file.filename}: dataset {name!r} has shape {actual}, expected ({text})")
-    sizes.update({letter: n for letter, n in zip(shape, actual, strict=True) if isinstance(letter, str)})
-    return dataset[()]
-
-
-def _floats(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], dtype: type = np.float32) -> np.ndarray:
-    """Read a dataset of finite numbers."""
-    value = _dataset(file, name, shape, sizes)
-    if value.dtype.kind not in "fiu":
-        raise ValueError(f"{file.filename}: dataset {name!r} must hold numbers, got {value.dtype}")
-    wrong = np.argwhere(~np.isfinite(value))
-    if len(wrong):
-        where = tuple(int(i) for i in wrong[0])
-        raise ValueError(
-            f"{file.filename}: dataset {name!r} is {value[where]} at {where}"
-            f" ({len(wrong)} such values): all must be finite"
-        )
-    return value.astype(dtype)
-
-
-def _integers(file: h5py.File, name: str, shape: tuple, sizes: dict[str, int], low: int, high: int) -> np.ndarray:
-    """Read a dataset of integers from `low` to `high` - 1."""
-    value = _dataset(file, name, shape, sizes)
-    if value.dtype.kind not in "iu":
-        raise ValueError(f"{file.filename}: dataset {name!r} must hold integers, got {value.dtype}")
-    wrong = np.argwhere((value < low) | (value >= high))
-    if len(wrong):
-        where = tuple(int(i) for i in wrong[0])
-        raise ValueError(f"{file.filename}: dataset {name!r} is {value[where]} at {where}, allowed {low} to {high - 1}")
-    return value.astype(np.int32)
-
-
-def _faces(file: h5py.File, shape: tuple, sizes: dict[str, int], vertices: int) -> np.ndarray:
-    """Read faces, each of three different vertices."""
-    faces = _integers(file, "faces", shape, sizes, 0, vertices)
+def _faces(file: Reader, letter: str, vertices: str) -> np.ndarray:
+    """Read faces [letter, 3], each of three different vertices."""
+    faces = file.integers("faces", (letter, 3), 0, file.sizes[vertices])
     a, b, c = faces.T
     twice = np.flatnonzero((a == b) | (b == c) | (c == a))
     if len(twice):
-        raise ValueError(f"{file.filename}: face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it")
+        file.fail(f"face {twice[0]} has a vertex twice, {faces[twice[0]].tolist()}: remove it")
     return faces
 
 
-def _check_sides(file: h5py.File, faces: np.ndarray) -> None:
+def _check_sides(file: Reader, faces: np.ndarray) -> None:
     """Raise a ValueError if the faces are not a sheet with two sides."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     for rows, allowed in ((np.sort(ends, axis=1), 2), (ends, 1)):
@@ -381,34 +285,31 @@ def _check_sides(file: h5py.File, faces: np.ndarray) -> None:
                 what = f"the edge of vertices {a} and {b} has {len(around)} faces, not two: separate the layers"
             else:
                 what = f"faces {around[0]} and {around[1]} are wound opposite ways: turn one"
-            raise ValueError(f"{file.filename}: {what}; `python -m data_prep.garment --mesh` checks and orients a mesh")
+            file.fail(f"{what}; `python -m data_prep.garment --mesh` checks and orients a mesh")
 
 
-def _weights(file: h5py.File, letter: str, sizes: dict[str, int]) -> np.ndarray:
+def _weights(file: Reader, letter: str) -> np.ndarray:
     """Read sparse skinning weights as a dense array [letter, J]."""
-    index = _integers(file, "weights_index", (letter, "n"), sizes, 0, sizes["J"])
-    value = _floats(file, "weights_value", (letter, "n"), sizes)
+    index = file.integers("weights_index", (letter, "n"), 0, file.sizes["J"])
+    value = file.floats("weights_value", (letter, "n"))
     wrong = np.flatnonzero((np.abs(value.sum(axis=1) - 1) > 1e-3) | (value.min(axis=1, initial=0) < 0))
     if len(wrong):
-        raise ValueError(
-            f"{file.filename}: dataset 'weights_value', row {wrong[0]} is {value[wrong[0]].tolist()}:"
-            " weights must be >= 0 and sum to 1"
+        file.fail(
+            f"dataset 'weights_value', row {wrong[0]} is {value[wrong[0]].tolist()}: weights must be >= 0 and sum to 1"
         )
-    dense = np.zeros((len(index), sizes["J"]), np.float32)
+    dense = np.zeros((len(index), file.sizes["J"]), np.float32)
     np.add.at(dense, (np.arange(len(index))[:, None], index), value)
     return dense / dense.sum(axis=1, keepdims=True)
 
 
-def _cloth(file: h5py.File, sizes: dict[str, int]) -> np.ndarray:
+def _cloth(file: Reader) -> np.ndarray:
     """Read the factors of a garment's cloth."""
-    factors = _floats(file, "cloth", ("V", 3), sizes)
+    factors = file.floats("cloth", ("V", 3))
     low, high = FACTORS
     wrong = np.argwhere((factors < low) | (factors > high))
     if len(wrong):
         where = tuple(int(i) for i in wrong[0])
-        raise ValueError(
-            f"{file.filename}: dataset 'cloth' is {factors[where]:g} at {where}: a factor from {low} to {high}"
-        )
+        file.fail(f"dataset 'cloth' is {factors[where]:g} at {where}: a factor from {low} to {high}")
     return factors
 
 
@@ -421,65 +322,31 @@ def _sparse(weights: Array) -> dict[str, np.ndarray]:
     return {"weights_index": index.astype(np.int16), "weights_value": value.astype(np.float32)}
 
 
-def _names(file: h5py.File, sizes: dict[str, int]) -> tuple[str, ...]:
-    names = _dataset(file, "joint_names", ("J",), sizes)
-    return tuple(str(_decoded(n)) for n in names)
-
-
-def _decoded(value: object) -> object:
-    return value.decode(errors="replace") if isinstance(value, bytes) else value
-
-
-def _strings(values: Sequence[str]) -> np.ndarray:
-    """Encode strings at one length, so that the dataset holds them; HDF5 puts others in a heap without checksums."""
-    encoded = [value.encode() for value in values]
-    return np.array(encoded, h5py.string_dtype("utf-8", max(map(len, encoded), default=0) or 1))
-
-
-def _check_parents(file: h5py.File, parents: np.ndarray) -> None:
+def _check_parents(file: Reader, parents: np.ndarray) -> None:
     """Raise a ValueError if the first joint is not the only root, or a joint stands before its parent."""
     order = np.arange(len(parents))
     wrong = np.flatnonzero((parents >= order) | ((parents < 0) != (order == 0)))
     if len(parents) == 0 or len(wrong):
         first = int(wrong[0]) if len(wrong) else 0
-        raise ValueError(
-            f"{file.filename}: dataset 'parents' is {parents[first : first + 1].tolist()} at joint {first}:"
+        file.fail(
+            f"dataset 'parents' is {parents[first : first + 1].tolist()} at joint {first}:"
             " the first joint must have -1, every other one a joint before it"
         )
 
 
-def _check_size(file: h5py.File, what: str, size: float, low: float, high: float) -> None:
+def _check_size(file: Reader, what: str, size: float, low: float, high: float) -> None:
     """Raise a ValueError for a length in m outside its range, with a guess at its real unit."""
     if low <= size <= high:
         return
     for unit, factor in (("centimetres", 100), ("millimetres", 1000)):
         if low <= size / factor <= high:
-            raise ValueError(f"{file.filename}: {what} {size:g} m looks like {unit}: divide lengths by {factor}")
-    raise ValueError(f"{file.filename}: {what} is {size:g} m, allowed {low} to {high}")
+            file.fail(f"{what} {size:g} m looks like {unit}: divide lengths by {factor}")
+    file.fail(f"{what} is {size:g} m, allowed {low} to {high}")
 
 
-def _refuse_joints(file: h5py.File, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
+def _refuse_joints(file: Reader, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
     """Raise a ValueError that lists how the joints of a motion differ from the body's."""
     lacking = [n for n in wanted if n not in names]
     further = [n for n in names if n not in wanted]
     text = f"lacks {lacking} and also has {further}" if lacking or further else f"has another order, {list(names)}"
-    raise ValueError(f"{file.filename}: joints differ from the body's: the motion {text}; retarget it (data_prep)")
-
-
-def _write(path: str | Path, kind: str, data: dict[str, np.ndarray], **attributes) -> None:
-    """Write datasets and attributes under a temporary name, then rename the file."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        # this version has checksums for all of a file: libhdf5 can crash on a damaged description of the data
-        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
-            fixed = {"format": f"clothjax/{kind}", "version": VERSION, "units": "m", "up": "+Y"}
-            for key, value in {**fixed, **attributes}.items():
-                file.attrs[key] = _strings([value])[0] if isinstance(value, str) else value
-            for key, value in data.items():
-                options = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": True}
-                file.create_dataset(key, data=value, **options)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    file.fail(f"joints differ from the body's: the motion {text}; retarget it (data_prep)")

@@ -12,7 +12,8 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.files import storage
 from clothjax.geometry import proximity
-from clothjax.runtime.inference import Bounds, FoldedLayer, Layer, Model, Network, blend_weights, initial_state, step
+from clothjax.runtime.inference import blend_weights, initial_state, step
+from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model, Network
 from clothjax.types import Array, Garment, Motion, Pose
 
 FOLD_RATIO = 0.75  # folding must leave at most this part of the weights of the layers around the code

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from clothjax.config import Config
-from clothjax.files import checkpoint, configuration, storage
+from clothjax.files import checkpoint, configuration, damage, storage
 from clothjax.networks.normalisation import Normalizers, Scale, Statistics, identity
 from clothjax.types import Material
 
@@ -225,7 +225,7 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
     tree: dict = {}
     try:
         with np.load(path, allow_pickle=False) as file:
-            storage.refuse_newer(path, int(file["format"]) if "format" in file.files else 1, FORMAT)
+            damage.refuse_newer(path, int(file["format"]) if "format" in file.files else 1, FORMAT)
             names = [name for name in file.files if name != "format" and not name.endswith("|scale")]
             for name in names:
                 leaf = file[name]
@@ -243,9 +243,9 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
             "statistics": _statistics(tree["statistics"]),
             "normalizers": _normalizers(tree["normalizers"]),
         }
-    except storage.NewerFormat:
+    except damage.NewerFormat:
         raise
-    except storage.UNREADABLE as error:
+    except damage.UNREADABLE as error:
         raise ValueError(
             f"{path}: not a whole packed model ({error}); install clothjax again, or pack the run again"
         ) from error

@@ -35,9 +35,9 @@ def assemble(config: Config) -> Experiment:
     Raises:
         ValueError: for a file that is missing or wrong, or a garment and a body that do not fit.
     """
-    body = storage.load_body(config.body)
+    body, names = storage.load_rig(config.body)
     garment = storage.load_garment(config.garment, body)
-    return Experiment(config, storage.joint_names(config.body), body, garment, scene.build_scene(garment, body, config))
+    return Experiment(config, names, body, garment, scene.build_scene(garment, body, config))
 
 
 def dress(experiment: Experiment, betas: Array | np.ndarray, material: Material) -> Character:

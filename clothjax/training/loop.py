@@ -50,19 +50,16 @@ def fit(
     config: dict,
     description: str = "",
     may_differ: tuple[str, ...] = (),
-    evaluate: Callable[[State], dict[str, float]] | None = None,
-    evaluate_steps: int = 1000,
     checkpoint_seconds: float = 120.0,
-    keep: int = 3,
     report_seconds: float = 10.0,
     max_nonfinite: int = MAX_NONFINITE,
 ) -> Fitted:
     """Train to `steps`, from the directory's newest checkpoint if there is one.
 
     The directory gets `checkpoints/`, `metrics.jsonl` and `training.json` (steps and seconds). A line of the metrics
-    is a call: the median of every metric, its maximum as `<name>_max`, the number of `nonfinite` steps, the figures of
-    `evaluate`. The training depends on nothing but the state: a run that is stopped at any moment and
-    resumed ends bit for bit as one that was not.
+    is a call: the median of every metric, its maximum as `<name>_max`, the number of `nonfinite` steps. The training
+    depends on nothing but the state: a run that is stopped at any moment and resumed ends bit for bit as one that was
+    not.
 
     Args:
         update: a jitted function that takes `steps_per_call` steps; it may donate its argument. Its metrics
@@ -72,9 +69,7 @@ def fit(
         config: what determines the training, as `configuration.to_dict` gives it; stored in every checkpoint.
         description: one line for a person, stored there too.
         may_differ: dotted names in `config` whose values may change between the sessions of a run.
-        evaluate: a function that returns figures of a state; called about every `evaluate_steps` steps.
         checkpoint_seconds: between two checkpoints; there is always one at the end.
-        keep: number of checkpoints that stay.
         report_seconds: between two lines where there is no terminal to show a bar on.
         max_nonfinite: skipped steps in a row that are tolerated.
 
@@ -96,14 +91,11 @@ def fit(
         with _records(directory, _step(fitted.state), steps, report_seconds) as record:
             for call in _calls(update, fitted.state, steps, steps_per_call, max_nonfinite):
                 fitted = fitted.after(call)
-                figures = _figures(call.metrics)
-                if evaluate and call.step // evaluate_steps > (call.step - steps_per_call) // evaluate_steps:
-                    figures |= {name: float(value) for name, value in evaluate(call.state).items()}
-                record(call, fitted, figures)
+                record(call, fitted, _figures(call.metrics))
                 stop = _anywhere(interrupted())
                 due = _anywhere(time.monotonic() - saved >= checkpoint_seconds)
                 if stop or due or call.step == steps:
-                    _save(checkpoints, call, config, description, keep)
+                    _save(checkpoints, call, config, description)
                     saved = time.monotonic()
                 if stop:
                     break
@@ -321,14 +313,14 @@ def _flat(config: Any, prefix: str = "") -> dict[str, Any]:
     return {k: v for key in config for k, v in _flat(config[key], f"{prefix}.{key}" if prefix else key).items()}
 
 
-def _save(checkpoints: Path, call: Call, config: dict, description: str, keep: int) -> None:
+def _save(checkpoints: Path, call: Call, config: dict, description: str) -> None:
     """Save a checkpoint; raise a FloatingPointError if there is a NaN in the state."""
     leaves = jax.tree_util.tree_flatten_with_path(call.state)[0]
     named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)}
     bad = [name for name, has_nan in jax.device_get(_any_nan(named)).items() if has_nan]
     if bad:
         raise FloatingPointError(f"the state of step {call.step} has NaN in {', '.join(bad[:5])}")
-    checkpoint.save(checkpoints, call.step, call.state, config, description, keep=keep)
+    checkpoint.save(checkpoints, call.step, call.state, config, description)
 
 
 @jax.jit

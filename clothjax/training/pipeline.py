@@ -231,7 +231,8 @@ def _principal_shapes(run: Run) -> np.ndarray | None:
         return None
     progress.say(f"blend shapes: from {sequences} rollouts of cloth that the physics moves")
     with progress_bar("simulating", sequences) as report:
-        return principal_shapes.principal(run.experiment.scene, run.clips, run.config, report, run.device_mesh)
+        frames = principal_shapes.simulate(run.experiment.scene, run.clips, run.config, report, run.device_mesh)
+    return principal_shapes.principal(frames, run.experiment.scene, run.config)
 
 
 def _add_seconds(run: Run, **seconds: float) -> dict[str, float]:

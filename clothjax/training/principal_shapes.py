@@ -23,13 +23,7 @@ MAX_DISPLACEMENT = 0.4  # m; a sequence in which a vertex is displaced farther i
 MAX_STEP = 1.0  # m, length of a descent step of all vertices together
 
 
-def principal(
-    scene: Scene,
-    clips: Clips,
-    config: Config,
-    progress: Callable[[int], None] = lambda _: None,
-    device_mesh: Mesh | None = None,
-) -> np.ndarray:
+def principal(frames: np.ndarray, scene: Scene, config: Config) -> np.ndarray:
     """Compute blend shapes [K, V, 3] m: the principal components of the displacements that `simulate` gives.
 
     Each is scaled to the energy of a shape of `laplacian_shapes.laplacian`.
@@ -41,7 +35,6 @@ def principal(
     Raises:
         ValueError: as `simulate`.
     """
-    frames = simulate(scene, clips, config, progress, device_mesh)
     rows = frames.reshape(-1, frames[0, 0].size).astype(np.float64)
     count = min(config.model.blendshapes, len(rows), rows.shape[1])
     # eigenvectors of the smaller of the two products; the mean is one of the components

@@ -15,7 +15,7 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.networks import baselines
 from clothjax.networks.mlp import Params
 from clothjax.runtime import specialise
-from clothjax.runtime.inference import Layer
+from clothjax.runtime.models import Layer
 
 JOINTS = 15  # that NCS reads, as published
 
@@ -67,25 +67,25 @@ def write(path: Path, baseline: Baseline, *, int8: bool = False, skinned: bool =
     if baseline.network == "ncs":
         units = [params["unit"]]
         locals_, joints = params["local"], params["dynamic"]["0"]["kernel"].shape[0] // baselines.LOCAL
-        given = {"static": (1, len(params["static"]["0"]["kernel"])), "dynamic": (joints, len(locals_["0"]["kernel"]))}
+        inputs = {"static": (1, len(params["static"]["0"]["kernel"])), "dynamic": (joints, len(locals_["0"]["kernel"]))}
     else:
         units = list(params["units"].values())
-        given = {"inputs": (1, len(units[0]["input"]["kernel"]))}
+        inputs = {"inputs": (1, len(units[0]["input"]["kernel"]))}
     width = len(units[0]["state"]["kernel"])
-    given["hidden"] = (1, len(units) * width)
-    found = {"next_hidden": given["hidden"]}
+    inputs["hidden"] = (1, len(units) * width)
+    outputs = {"next_hidden": inputs["hidden"]}
     code = _ncs(g, params, joints) if baseline.network == "ncs" else _snug(g, units)
     if skinned:
-        given["transforms"] = (1, len(baseline.weights), 12)
-        found["vertices"] = (1, len(baseline.template), 3)
+        inputs["transforms"] = (1, len(baseline.weights), 12)
+        outputs["vertices"] = (1, len(baseline.template), 3)
         code = g.layer(code, baseline.mix) if baseline.mix else code
         garment = g.layer(code, _by_coordinate(baseline))
         moved = g.skinned(garment, "transforms", baseline.weights.astype(np.float32))
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")
     else:
-        found["code"] = (1, len(baseline.shapes.kernel))
+        outputs["code"] = (1, len(baseline.shapes.kernel))
         g("Identity", code, name="code")
-    g.save(path, given, found)
+    g.save(path, inputs, outputs)
     return path
 
 
@@ -101,14 +101,14 @@ def run(path: Path, inputs: list[dict[str, np.ndarray]]) -> np.ndarray:
     Args:
         inputs: of each frame, except `hidden`; entries that the graph does not read are ignored.
     """
-    one, found = session(path), []
+    one, frames = session(path), []
     read, last = {value.name for value in one.get_inputs()}, one.get_outputs()[-1].name
     hidden = np.zeros(next(value.shape for value in one.get_inputs() if value.name == "hidden"), np.float32)
     for frame in inputs:
         fed = {name: value for name, value in frame.items() if name in read}
         hidden, result = one.run(["next_hidden", last], fed | {"hidden": hidden})
-        found.append(result[0])
-    return np.stack(found)
+        frames.append(result[0])
+    return np.stack(frames)
 
 
 def _by_coordinate(baseline: Baseline) -> Layer:

@@ -30,40 +30,40 @@ def compare(new: dict, old: dict) -> dict:
 def times(part, place: str = "", timed: bool = False) -> dict[str, float]:
     """Return the times of a report by their place in it: entries with a unit of time in their name or their table's."""
     if isinstance(part, dict):
-        found = {}
+        leaves = {}
         for key, value in part.items():
             below = f"{place}/{key}" if place else key
             of_time = bool(TIMES & set(key.split("_"))) and not key.endswith("_ratio")
-            found |= times(value, below, timed or of_time)
-        return found
+            leaves |= times(value, below, timed or of_time)
+        return leaves
     if isinstance(part, list):
-        found = {}
+        leaves = {}
         for row in part:
             if isinstance(row, dict) and "name" in row:
                 name = " ".join(str(row[key]) for key in ("garment", "run", "name") if row.get(key))
-                found |= times(row, f"{place}/{name}", timed)
-        return found
+                leaves |= times(row, f"{place}/{name}", timed)
+        return leaves
     number = isinstance(part, int | float) and not isinstance(part, bool)
     return {place: float(part)} if timed and number else {}
 
 
 def lines(compared: dict) -> list[str]:
     """Return the comparison as readable lines."""
-    found = []
+    said = []
     if compared["other_machine"]:
-        found.append(f"not the same machine as then: {', '.join(compared['other_machine'])} differ")
+        said.append(f"not the same machine as then: {', '.join(compared['other_machine'])} differ")
     for part, result in compared.items():
         if part == "other_machine":
             continue
         beyond = {name: result["ratios"][name] for name in result["beyond_noise"]}
-        found.append(
+        said.append(
             f"{part}: {len(result['ratios'])} times compared, {len(beyond)} differ by more than noise "
             f"({result['noise']:.2f} x)"
         )
-        found += [
+        said += [
             f"  {'SLOWER' if ratio > 1 else 'faster'} {ratio:.2f} x  {name}"
             for name, ratio in sorted(beyond.items(), key=lambda item: -item[1])
         ]
         if "rank_tau" in result:
-            found.append("  order of the points, Kendall's tau: " + str(result["rank_tau"]))
-    return found
+            said.append("  order of the points, Kendall's tau: " + str(result["rank_tau"]))
+    return said

@@ -19,8 +19,8 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import configuration, storage
 from clothjax.networks import decoder, psi
 from clothjax.networks.normalisation import Normalizers, Scale
-from clothjax.runtime import inference, specialise
-from clothjax.runtime.inference import Model
+from clothjax.runtime import inference, models, specialise
+from clothjax.runtime.models import Model
 from clothjax.simulation import assembly
 from clothjax.types import Motion, Pose
 from experiments.benchmark import baselines, timing
@@ -71,9 +71,7 @@ def paper_model() -> Model:
         return Scale(jnp.zeros(size), jnp.ones(size), jnp.full(size, -8.0), jnp.full(size, 8.0))
 
     normalizers = Normalizers(scale(size), scale(count))
-    return inference.build(
-        config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers
-    )
+    return models.build(config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers)
 
 
 def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
@@ -122,9 +120,9 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
 
 def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     """Measure variants of a garment of the library: time, bytes, and distance in a rollout to the unspecialised one."""
-    config = inference.load(SHIPPED).config
+    config = models.load(SHIPPED).config
     betas = assembly.betas(config)
-    model = inference.load(SHIPPED, betas=betas)
+    model = models.load(SHIPPED, betas=betas)
     clip = assembly.there_and_back(storage.load_motion("walk_3", model.names), frames)
     motion = Motion(clip.rotations, (clip.translation - clip.translation[:1]).astype(np.float32), clip.fps)
     reference = np.asarray(inference.animate(model, motion)[0])
@@ -133,23 +131,23 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     forms["half of the shapes"] = specialise.specialise(model, blendshapes=len(model.network.shapes) // 2)
     forms["4 influences"] = specialise.specialise(model, max_influences=4)
     library = _library(folder)
-    calls, found = {}, {}
+    calls, outcomes = {}, {}
     for name, form in forms.items():
         for int8 in (False, True):
             path = onnx.to_onnx(form, folder / "form.onnx", int8=int8)
             error = np.linalg.norm(onnx.run_onnx(path, form, motion) - reference, axis=-1)
             kind = f"{name}, int8" if int8 else name
             calls[kind] = onnx_call(path, form)
-            found[kind] = (error, path.stat().st_size, "onnx")
+            outcomes[kind] = (error, path.stat().st_size, "onnx")
         if library:
             path = native.to_c(form, folder / "form.psi")
             error = np.linalg.norm(native.run_c(library, path, motion) - reference, axis=-1)
             calls[f"C: {name}"] = c_call(library, path, form)
-            found[f"C: {name}"] = (error, path.stat().st_size, "c")
+            outcomes[f"C: {name}"] = (error, path.stat().st_size, "c")
         if name in ("plain", "folded", "a third of the shapes"):
             error = np.linalg.norm(np.asarray(inference.animate(form, motion)[0]) - reference, axis=-1)
             calls[f"jax: {name}"] = jax_call(form)
-            found[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), "jax")
+            outcomes[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), "jax")
     folded = forms["folded"]
     fine = specialise.on_mesh(model, storage.load_garment(FINE, storage.load_body(config.body)), betas)
     fine = specialise.specialise(fine)
@@ -173,7 +171,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     variants = [
         {"name": name, "us": us[name], "error_mm": 1e3 * float(error.mean()), "error_mm_max": 1e3 * float(error.max()),
          "bytes": size, "floor_us": floor_us(size), "runtime": runtime}
-        for name, (error, size, runtime) in found.items()
+        for name, (error, size, runtime) in outcomes.items()
     ]  # fmt: skip
     exact = stablehlo.run_stablehlo(stablehlo.to_stablehlo(folded, folder / "form.stablehlo"), folded, motion)
     worst = {v["name"]: v["error_mm_max"] for v in variants}
@@ -193,7 +191,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
 
 def _resting() -> dict:
     """Measure the time saved on a character that stops and is skipped once `resting` is true, and the error."""
-    model = specialise.specialise(inference.load(SHIPPED))
+    model = specialise.specialise(models.load(SHIPPED))
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
     poses += poses[-1:] * STILL
@@ -211,12 +209,12 @@ def _resting() -> dict:
 
 def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
     """Measure microseconds a character in crowds in jax, each character with its own body."""
-    models = [specialise.specialise(inference.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
+    wearers = [specialise.specialise(models.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
     calls = {}
     for count in crowds:
-        crowd = inference.crowd([models[i % len(models)] for i in range(count)])
-        pose = _pose(models[0])
-        states = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), inference.initial_state(models[0], pose))
+        crowd = models.crowd([wearers[i % len(wearers)] for i in range(count)])
+        pose = _pose(wearers[0])
+        states = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), inference.initial_state(wearers[0], pose))
         poses = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), pose)
         step = jax.jit(inference.step_crowd).lower(crowd, states, poses).compile()
         calls[str(count)] = lambda step=step, a=(crowd, states, poses): jax.block_until_ready(step(*a))
@@ -303,16 +301,16 @@ def given_features(model: Model, path: Path, *, int8: bool, skinned: bool = True
     """
     g, network = Graph(int8), model.network
     count, size, vertices = len(network.pose_mean), len(network.first), model.wearer.template.shape[1]
-    given, found = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
+    inputs, outputs = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
     if skinned:
-        given["transforms"], found["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
+        inputs["transforms"], outputs["vertices"] = (1, len(network.weights), 12), (1, vertices, 3)
         moved = g.skinned(onnx.canonical(g, latent, model), "transforms", network.weights)
         g("Transpose", moved, perm=[0, 2, 1], name="vertices")
     else:
-        found["weights"] = (1, len(network.shapes))
+        outputs["weights"] = (1, len(network.shapes))
         g("Identity", onnx.shape_weights(g, latent, model), name="weights")
-    g.save(path, given, found)
+    g.save(path, inputs, outputs)
     return path
 
 

@@ -66,9 +66,9 @@ def measure(
             variants, solved = every(case, of_it, Path(folder), descent_steps, iterations, shapes)
             us = interleaved({key: each.call for key, each in variants.items() if each.call}, rounds)
             for key, each in variants.items():
-                found = {"name": key[1], "run": _short(key[0]), "family": each.family, "garment": garment}
-                found |= {"runtime": each.runtime, "us": us.get(key, each.us), "converged": each.converged}
-                points.append(found | _errors(case, each.tracks, solved, gaps))
+                point = {"name": key[1], "run": _short(key[0]), "family": each.family, "garment": garment}
+                point |= {"runtime": each.runtime, "us": us.get(key, each.us), "converged": each.converged}
+                points.append(point | _errors(case, each.tracks, solved, gaps))
             report(index + 1)
     for point in points:
         others = [p for p in points if p["garment"] == point["garment"]]
@@ -124,11 +124,11 @@ def rank_tau(points: list[dict], others: list[dict]) -> dict[str, float | None]:
     """Return the number of `points` that two reports share, and Kendall's tau of their orders by time and error."""
     named = {(p["garment"], p["run"], p["name"]): p for p in others}
     pairs = [(p, named[key]) for p in points if (key := (p["garment"], p["run"], p["name"])) in named]
-    found = {"points": len(pairs)}
+    agreement = {"points": len(pairs)}
     for key in ("us", *ERRORS):
         tau = float(kendalltau([one[key] for one, _ in pairs], [other[key] for _, other in pairs]).statistic)
-        found[key] = tau if np.isfinite(tau) else None  # all alike have no order
-    return found
+        agreement[key] = tau if np.isfinite(tau) else None  # all alike have no order
+    return agreement
 
 
 def _better(one: dict, other: dict, error: str) -> bool:
@@ -149,11 +149,11 @@ def _errors(case: Case, tracks: list[np.ndarray], solved: list[np.ndarray], gaps
         beside = metrics.beside_solver(experiment.scene, *(x[SETTLING_FRAMES:] for x in (track, reference, skinned)))
         ratio, correlation = beside["swing_ratio"], beside["swing_correlation"]
         swings.append(ratio**2 + 1.0 - 2.0 * ratio * correlation)  # of |a - b|^2 / |b|^2
-    found = metrics.gaps(measures)
+    mean = metrics.gaps(measures)
     return {
-        "energy_gap": found["energy_gap"],
-        "hold_gap": found["hold_gap"],
-        "step_error_mm": found["step_error_mm"],
+        "energy_gap": mean["energy_gap"],
+        "hold_gap": mean["hold_gap"],
+        "step_error_mm": mean["step_error_mm"],
         "swing_error": float(np.sqrt(max(np.mean(swings), 0.0))),
     }
 

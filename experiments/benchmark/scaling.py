@@ -22,7 +22,7 @@ SIZES = (500, 1000, 2000, 4000, 8000, 20000)
 
 def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
     """Measure seconds of a training step on t-shirts of about these sizes in vertices, and the exponent of growth."""
-    body, names = storage.load_body(config.body), storage.joint_names(config.body)
+    body, names = storage.load_rig(config.body)
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1))
     programs, clips = {}, None
     with progress_bar("compiling for each size", len(sizes)) as report:

@@ -209,8 +209,8 @@ def _pieces(experiment: Experiment, moment: Moment) -> dict:
     cloth, (character, window, step, seen) = simulation.cloth, moment.first
 
     def contact(simulation):
-        found = stage1.first_step(scene, simulation, moment.clips, config)
-        return found.step, found.seen.world
+        first = stage1.first_step(scene, simulation, moment.clips, config)
+        return first.step, first.seen.world
 
     def passing(params, seen):
         return jnp.mean(passed(params, statistics, scene, seen, config.model) ** 2)

@@ -21,7 +21,7 @@ from clothjax.files import storage
 from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
 from clothjax.networks.baselines import inputs as baseline_inputs
-from clothjax.runtime import inference, specialise, trained
+from clothjax.runtime import models, specialise, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
@@ -94,11 +94,11 @@ def every(
     for run in runs:
         network = trained.network(run)[0].peer.network
         if network in ("ncs", "snug"):
-            found = _baseline(case, run, folder, shapes)
+            of_run = _baseline(case, run, folder, shapes)
         else:
-            found = _psi(case, run, network or "psi", folder, shapes)
-            found |= {} if network else _phi(case, run, descent_steps)
-        variants |= {(str(run), name): each for name, each in found.items()}
+            of_run = _psi(case, run, network or "psi", folder, shapes)
+            of_run |= {} if network else _phi(case, run, descent_steps)
+        variants |= {(str(run), name): each for name, each in of_run.items()}
     solver, solved = _solver(case, iterations)
     others = solver | _position_based(case, [track[0] for track in solved])
     return variants | {("", name): each for name, each in others.items()}, solved
@@ -123,7 +123,7 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
     pose, like in C.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
-    model = inference.load(run, betas=np.asarray(case.character.betas))
+    model = models.load(run, betas=np.asarray(case.character.betas))
     count = len(model.network.shapes)
     forms = {family: specialise.specialise(model)}
     forms |= {

@@ -17,7 +17,7 @@ from clothjax.geometry import topology
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.physics import solver
-from clothjax.runtime import inference, specialise, trained
+from clothjax.runtime import inference, models, specialise, trained
 from clothjax.simulation import assembly, characters, reference, rollout
 from clothjax.types import Material, Pose
 
@@ -39,12 +39,12 @@ class Outfit:
     """
 
     def __init__(self, run: Path, betas: np.ndarray, material: Material | None, count: int = 1, fine: bool = False):
-        model = inference.load(run, betas=betas, material=material)
+        model = models.load(run, betas=betas, material=material)
         if fine and (garment := finer(model.config)):
             body = storage.load_body(model.config.body)
             model = specialise.on_mesh(model, storage.load_garment(garment, body), betas)
         self.model, self.count = model, count
-        self._crowd = inference.crowd([model] * count)
+        self._crowd = models.crowd([model] * count)
         self._states = None
         self._run, self._betas, self._material = run, betas, material
         self._beside: dict[str, tuple] = {}
@@ -65,10 +65,10 @@ class Outfit:
 
     def psi(self, poses: list[Pose]) -> np.ndarray:
         """Return vertices [N, V, 3] m of the next frame, for the characters' poses."""
-        given = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
+        together = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
         if self._states is None:
-            self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(given)
-        self._states, vertices = inference.step_crowd(self._crowd, self._states, given)
+            self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(together)
+        self._states, vertices = inference.step_crowd(self._crowd, self._states, together)
         return np.asarray(vertices)
 
     def beside(self, stages: list[str], window: Pose) -> dict[str, np.ndarray]:

@@ -77,10 +77,10 @@ class Viewer:
             self.count = gui.add_slider("Characters", 1, 100, 1, 1)
             self.betas = [gui.add_slider(f"Body {i + 1}", -3.0, 3.0, 0.1, 0.0) for i in range(BETAS)]
             self.ranges = {name: getattr(config.material, f"{name}_range") for name in Material._fields}
-            given = {name: float(scaled(getattr(config.material, name), self.ranges[name])) for name in self.ranges}
+            values = {name: float(scaled(getattr(config.material, name), self.ranges[name])) for name in self.ranges}
             self.material = {
                 name: gui.add_slider(name.capitalize(), 0.0, 1.0, 0.01, round(share, 2))
-                for name, share in given.items()
+                for name, share in values.items()
             }
         with gui.add_folder("Show"):
             self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
@@ -251,11 +251,11 @@ def start(arguments: argparse.Namespace) -> Viewer:
         folder = cli.model_folder(garment)
         garments, garment = {folder.name: folder}, folder.name
     config = trained.psi(garments[garment]).config
-    body, names = storage.load_body(config.body), storage.joint_names(config.body)
+    body, names = storage.load_rig(config.body)
     motions = clips(arguments.motions, names)
-    found = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
-    wander = tuple(name for name in found.families if name in WANDER) or found.families
-    return Viewer(server, Show(found, wander, garments[garment]), garments, garment)
+    library = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
+    wander = tuple(name for name in library.families if name in WANDER) or library.families
+    return Viewer(server, Show(library, wander, garments[garment]), garments, garment)
 
 
 def clips(paths: list[Path] | None, names: tuple[str, ...]) -> dict[str, Motion]:
@@ -266,10 +266,10 @@ def clips(paths: list[Path] | None, names: tuple[str, ...]) -> dict[str, Motion]
     """
     if paths is None:
         return {name: storage.load_motion(name, names) for name in CLIPS}
-    found: dict[str, Motion] = {}
+    loaded: dict[str, Motion] = {}
     for path in paths:
         name = path.name.removesuffix(".h5").removesuffix(".motion")
-        if name in found:
+        if name in loaded:
             raise ValueError(f"{path}: another clip is called {name} too: rename one")
-        found[name] = storage.load_motion(path, names)
-    return found
+        loaded[name] = storage.load_motion(path, names)
+    return loaded

@@ -106,8 +106,8 @@ def contacts(random: np.random.Generator, count: int) -> tuple[Callable, np.ndar
     patches = proximity.patches(body, faces)
 
     def distances(positions):
-        found = contact_search.find(positions, *2 * (jnp.asarray(body, positions.dtype),), patches)
-        return contact_search.distance(positions, found.point_next, found.normal_next)
+        contact = contact_search.find(positions, *2 * (jnp.asarray(body, positions.dtype),), patches)
+        return contact_search.distance(positions, contact.point_next, contact.normal_next)
 
     return distances, on + off * random.normal(size=(count, 3)), ()
 

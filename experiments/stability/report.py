@@ -27,7 +27,7 @@ import numpy as np
 from clothjax import cli
 from clothjax.config import Config
 from clothjax.progress import progress_bar
-from experiments.stability import closed_loop, physics, solver
+from experiments.stability import physics, rollouts, solver
 
 matplotlib.use("Agg")
 
@@ -70,7 +70,7 @@ def stress(run: Path | None, quick: bool = False) -> tuple[dict, dict]:
     if run is None:
         return report, {}
     with progress_bar("rollouts", 4) as done:
-        measured = closed_loop.stress(run, 1000 if quick else 10000, quick, done)
+        measured = rollouts.stress(run, 1000 if quick else 10000, quick, done)
     loops, shocks = measured["loops"], measured["shocks"]
     recovery = {name: shock.recovery for name, shock in shocks.items()}
     report["closed_loop"] = {
@@ -180,8 +180,8 @@ def plot(report: dict, curves: dict, path: Path) -> None:
     third.axhline(1.0, color="black", linestyle=":")
     third.set(title="drift on a frozen pose", xlabel="frame", ylabel="farthest vertex, mm")
     for name, energy in curves.get("energy", {}).items():
-        fourth.plot(np.arange(len(energy)) - closed_loop.BEFORE + 3, energy, label=name)
-    fourth.axhspan(1 - closed_loop.WITHIN, 1 + closed_loop.WITHIN, color="0.9")
+        fourth.plot(np.arange(len(energy)) - rollouts.BEFORE + 3, energy, label=name)
+    fourth.axhspan(1 - rollouts.WITHIN, 1 + rollouts.WITHIN, color="0.9")
     fourth.set(title="after a shock", xlabel="frame", ylabel="energy over the undisturbed", yscale="log")
     for axis in (third, fourth):
         if axis.get_legend_handles_labels()[0]:

@@ -21,7 +21,7 @@ from clothjax.export import onnx
 from clothjax.files import storage
 from clothjax.progress import progress_bar
 from clothjax.render import ray_cast
-from clothjax.runtime import inference, specialise, trained
+from clothjax.runtime import models, specialise, trained
 from clothjax.types import Body
 
 HERE = Path(__file__).parent
@@ -41,20 +41,20 @@ def main(argv: list[str]) -> None:
     for folder in ("garments", "motions"):
         (arguments.out / folder).mkdir(parents=True, exist_ok=True)
     names = arguments.model or trained.shipped()
-    models = {Path(name).resolve().name: inference.load(cli.model_folder(name)) for name in names}
-    if len(models) < len(names):
+    garments = {Path(name).resolve().name: models.load(cli.model_folder(name)) for name in names}
+    if len(garments) < len(names):
         raise ValueError(f"two models have one name: {', '.join(names)}; rename one")
-    first, *others = models.values()
+    first, *others = garments.values()
     if any(model.config.body != first.config.body for model in others):
-        raise ValueError(f"{', '.join(models)} are not all of one body: leave some out")
+        raise ValueError(f"{', '.join(garments)} are not all of one body: leave some out")
     clips = {Path(name).stem: storage.load_motion(name, first.names) for name in arguments.motions}
     if len(clips) < len(arguments.motions):
         raise ValueError(f"two motions have one name: {', '.join(arguments.motions)}; rename one")
-    for name, given in (clips | {name: model.config for name, model in models.items()}).items():
-        if abs(given.fps - first.config.fps) > 1e-3:
-            raise ValueError(f"{name} has {given.fps} frames a second, {next(iter(models))} {first.config.fps}")
-    with progress_bar("exporting", len(models)) as report:
-        for index, (name, model) in enumerate(models.items()):
+    for name, timed in (clips | {name: model.config for name, model in garments.items()}).items():
+        if abs(timed.fps - first.config.fps) > 1e-3:
+            raise ValueError(f"{name} has {timed.fps} frames a second, {next(iter(garments))} {first.config.fps}")
+    with progress_bar("exporting", len(garments)) as report:
+        for index, (name, model) in enumerate(garments.items()):
             onnx.to_onnx(specialise.specialise(model), arguments.out / "garments" / f"{name}.onnx", int8=True)
             report(index + 1)
     about = body(storage.load_body(first.config.body), arguments.out / "body.bin")
@@ -62,7 +62,7 @@ def main(argv: list[str]) -> None:
         place = clip.translation - clip.translation[:1] * [1, 0, 1]
         rows = np.concatenate([np.reshape(clip.rotations, (len(place), -1)), place], axis=1)
         rows.astype("<f4").tofile(arguments.out / "motions" / f"{name}.bin")
-    about |= {"garments": list(models), "motions": list(clips), "fps": first.config.fps}
+    about |= {"garments": list(garments), "motions": list(clips), "fps": first.config.fps}
     about |= {"skin": ray_cast.SKIN, "cloth": ray_cast.CLOTH}
     (arguments.out / "about.json").write_text(json.dumps(about))
     bundle(arguments.out)

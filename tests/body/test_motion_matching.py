@@ -14,8 +14,7 @@ WANDER = ("walk", "run", "arms")
 
 @pytest.fixture(scope="module")
 def clips():
-    body = storage.load_body("body")
-    names = storage.joint_names("body")
+    body, names = storage.load_rig("body")
     motions = {name: storage.load_motion(name, names) for name in NAMES}
     return motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
 
@@ -91,7 +90,7 @@ def test_it_jumps_when_asked_and_only_then(clips):
 @pytest.mark.parametrize("root", [(0.0, 0.0, 0.0), (0.2, -0.1, 0.3)])
 def test_it_does_the_same_elsewhere(root):
     """Nothing depends on where it is, which way it faces, or where a body has its root joint."""
-    body, names = storage.load_body("body"), storage.joint_names("body")
+    body, names = storage.load_rig("body")
     motions = {name: storage.load_motion(name, names) for name in ("walk_0", "arms_0")}
     joints = np.asarray(body.joints) + np.array(root)
     clips = motion_matching.library(motions, joints, body.parents, names)
@@ -108,8 +107,7 @@ def test_it_does_the_same_elsewhere(root):
 
 
 def test_clips_that_do_not_belong_together_are_refused():
-    body = storage.load_body("body")
-    names = storage.joint_names("body")
+    body, names = storage.load_rig("body")
     walk = storage.load_motion("walk_0", names)
     given = (np.asarray(body.joints), body.parents)
     with pytest.raises(ValueError, match="at least one clip"):

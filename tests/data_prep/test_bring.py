@@ -13,7 +13,7 @@ from clothjax.files import storage
 
 def cape() -> trimesh.Trimesh:
     """A cape: open in front, from the neck to the thighs, around all that is there but the arms."""
-    body, names = storage.load_body("body"), storage.joint_names("body")
+    body, names = storage.load_rig("body")
     joint = dict(zip(names, np.asarray(body.joints)))
     top, bottom = joint["Neck"][1], joint["LeftUpLeg"][1] - 0.05
     trunk = np.asarray(body.vertices)

@@ -19,10 +19,10 @@ from clothjax.training import loss, stage1
 @pytest.fixture(scope="module")
 def walking():
     config = dataclasses.replace(small(), motions=("walk_0",))
-    whole = assembly.assemble(config)
-    character = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    poses = rollouts.windows(assembly.motion(whole, "walk_3"))
-    return whole, character, poses
+    experiment = assembly.assemble(config)
+    character = characters.dress(experiment.scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    poses = rollouts.windows(assembly.motion(experiment, "walk_3"))
+    return experiment, character, poses
 
 
 def test_gaps_are_ratios_of_summed_energies():
@@ -45,14 +45,14 @@ def test_gaps_are_ratios_of_summed_energies():
 
 
 def test_skinning_has_an_energy_gap_of_one_and_the_solver_none(walking):
-    whole, character, poses = walking
+    experiment, character, poses = walking
     short = jax.tree.map(lambda x: x[:8], poses)
-    skinned = rollouts.skinned_trajectory(whole, character, short)
-    gaps = metrics.gaps(metrics.step_measures(whole.scene, character, skinned, short, [5], whole.config))
+    skinned = rollouts.skinned_trajectory(experiment, character, short)
+    gaps = metrics.gaps(metrics.step_measures(experiment.scene, character, skinned, short, [5], experiment.config))
     assert gaps["energy_gap"] == pytest.approx(1.0, abs=1e-6) and gaps["solver_converged"] == 1.0
-    solved, infos = reference.simulate(whole.scene, character, short, whole.config)
+    solved, infos = reference.simulate(experiment.scene, character, short, experiment.config)
     assert len(solved) == 9 and all(info.converged for info in infos)
-    gaps = metrics.gaps(metrics.step_measures(whole.scene, character, solved, short, [5], whole.config))
+    gaps = metrics.gaps(metrics.step_measures(experiment.scene, character, solved, short, [5], experiment.config))
     assert abs(gaps["energy_gap"]) < 1e-3 and gaps["hold_gap"] < 0.05 and gaps["step_error_mm"] < 1.0
 
 
@@ -67,32 +67,32 @@ def test_penetration_is_how_deep_inside():
 
 
 def test_beside_the_solver_itself_nothing_differs(walking):
-    whole, character, poses = walking
-    skinned = rollouts.skinned_trajectory(whole, character, jax.tree.map(lambda x: x[:6], poses))
+    experiment, character, poses = walking
+    skinned = rollouts.skinned_trajectory(experiment, character, jax.tree.map(lambda x: x[:6], poses))
     time = np.arange(6)[:, None, None]
     swing = 0.01 * np.sin(time + skinned[:1])
-    same = metrics.beside_solver(whole.scene, skinned + swing, skinned + swing, skinned)
+    same = metrics.beside_solver(experiment.scene, skinned + swing, skinned + swing, skinned)
     expected = {"swing_ratio": 1.0, "swing_correlation": 1.0, "rollout_error_mm": 0.0, "wrinkle_ratio": 1.0}
     assert same == pytest.approx(expected)
-    twice = metrics.beside_solver(whole.scene, skinned - 2 * swing, skinned + swing, skinned)
+    twice = metrics.beside_solver(experiment.scene, skinned - 2 * swing, skinned + swing, skinned)
     assert twice["swing_ratio"] == pytest.approx(2.0) and twice["swing_correlation"] == pytest.approx(-1.0)
     assert twice["rollout_error_mm"] == pytest.approx(3e3 * np.linalg.norm(swing, axis=-1).mean())
-    still = metrics.beside_solver(whole.scene, skinned, skinned + swing, skinned)
+    still = metrics.beside_solver(experiment.scene, skinned, skinned + swing, skinned)
     assert still["swing_ratio"] == 0.0 and still["swing_correlation"] == 0.0
 
 
 @pytest.mark.slow
 def test_all_of_space_contains_the_minimum(walking):
     """With a blend shape for every coordinate the span's minimum is the solver's, with none but one it is not."""
-    whole, character, poses = walking
+    experiment, character, poses = walking
     short = jax.tree.map(lambda x: x[:8], poses)
-    skinned = rollouts.skinned_trajectory(whole, character, short)
+    skinned = rollouts.skinned_trajectory(experiment, character, short)
     size = skinned[0].size
     gap = {}
     for count in (1, 300, size):
         shapes = np.random.default_rng(0).normal(size=(count, size)) if count < size else np.eye(size)
         measures = metrics.step_measures(
-            whole.scene, character, skinned, short, [5], whole.config, shapes.reshape(count, -1, 3)
+            experiment.scene, character, skinned, short, [5], experiment.config, shapes.reshape(count, -1, 3)
         )
         gap[count] = metrics.gaps(measures)["span_gap"]
     assert gap[1] > gap[300] > gap[size] and gap[size] < 0.02
@@ -122,21 +122,21 @@ def test_a_term_of_no_weight_is_not_computed():
 
 def test_pinned_vertices_follow_skinning():
     config = dataclasses.replace(small(), garment="skirt_1000", motions=("walk_0",))
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    state = stage1.init(whole.scene, reel, config)
-    character = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    poses = jax.tree.map(lambda x: x[:6], rollouts.windows(assembly.motion(whole, "walk_3")))
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    state = stage1.init(experiment.scene, reel, config)
+    character = characters.dress(experiment.scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    poses = jax.tree.map(lambda x: x[:6], rollouts.windows(assembly.motion(experiment, "walk_3")))
     model = {"params": state.params, "statistics": state.statistics}
 
     @jax.jit
     def play(model, poses):
-        animator = animators.phi_animator(model, whole.scene, character, config)
-        return rollout.play(animator, whole.scene, character, poses, config)
+        animator = animators.phi_animator(model, experiment.scene, character, config)
+        return rollout.play(animator, experiment.scene, character, poses, config)
 
     _, states, _ = play(model, poses)
-    skinned = rollouts.skinned_trajectory(whole, character, poses)
-    pinned = np.asarray(whole.garment.pinned)
+    skinned = rollouts.skinned_trajectory(experiment, character, poses)
+    pinned = np.asarray(experiment.garment.pinned)
     assert pinned.sum() > 10
     np.testing.assert_allclose(np.asarray(states.position)[:, pinned], skinned[:, pinned], atol=1e-5)
     assert np.abs(np.asarray(states.position)[:, ~pinned] - skinned[:, ~pinned]).max() > 1e-5

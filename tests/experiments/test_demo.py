@@ -36,7 +36,7 @@ SKIRT, TSHIRT, DRESS = (trained.folder(name) for name in ("skirt", "tshirt", "dr
 
 @pytest.fixture(scope="module")
 def clips():
-    body, names = storage.load_body("body"), storage.joint_names("body")
+    body, names = storage.load_rig("body")
     motions = {name: storage.load_motion(name, names) for name in ("walk_0", "run_0", "arms_0", "jump_0")}
     return motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
 

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import shutil
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,12 +14,12 @@ from clothjax.evaluation import metrics, pictures, rollouts
 from clothjax.evaluation import report as measures
 from clothjax.files import checkpoint
 from clothjax.networks import normalisation
-from clothjax.runtime import inference, trained
+from clothjax.runtime import models, trained
 from clothjax.simulation import assembly, scene
 from clothjax.training import pipeline
 from clothjax.types import Motion
 from experiments import evaluate, gallery, quickstart, render, tune
-from experiments.stability import closed_loop
+from experiments.stability import rollouts as stability_rollouts
 from experiments.stability.report import main, solver
 
 TOY = [
@@ -30,6 +31,17 @@ TOY = [
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
     "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
+
+
+class Picture(NamedTuple):
+    width: int
+    height: int
+    frames: int
+
+
+def picture(path):
+    with Image.open(path) as opened:
+        return Picture(*opened.size, getattr(opened, "n_frames", 1))
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +76,8 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
     assert report["quickstart"]["train_seconds"] > 0
     assert report["quickstart"]["onnx_error_mm"] < 0.1
     assert "hold_gap" in (finished / "report.md").read_text()
-    assert Image.open(finished / "comparison.png").size[0] > 1000
-    assert Image.open(finished / "walk.webp").n_frames == 6
+    assert picture(finished / "comparison.png").width > 1000
+    assert picture(finished / "walk.webp").frames == 6
     assert (finished / "tshirt.glb").stat().st_size > 10_000
     assert json.loads((finished / "tshirt.json").read_text())["shapes"]["rotations"] == [1, 31, 3, 3]
 
@@ -83,16 +95,16 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch
     assert "twist_3" in json.loads((finished / "twist.json").read_text())["motions"]
     assert "| hold_gap |" in capsys.readouterr().out
     render.main([str(finished), "--motions", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
-    assert Image.open(finished / "t.webp").n_frames == 3
+    assert picture(finished / "t.webp").frames == 3
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
-    picture = finished / "bodies.png"
+    path = finished / "bodies.png"
     monkeypatch.setattr(pictures, "GALLERY_BODIES", ("heavy",))
-    gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(picture)])
-    width, height = Image.open(picture).size
+    gallery.main([str(finished), "--motions", "twist_3", "--frame", "2", "--out", str(path)])
+    width, height, _ = picture(path)
     assert width > pictures.GALLERY_SIZE[0] and height > 3 * pictures.GALLERY_SIZE[1]  # a body; three methods
     with pytest.raises(ValueError, match=r"twist_3 has frames 1 to \d+ to show, not 1000"):
-        gallery.main([str(finished), "--motions", "twist_3", "--frame", "1000", "--out", str(picture)])
+        gallery.main([str(finished), "--motions", "twist_3", "--frame", "1000", "--out", str(path)])
 
 
 def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
@@ -109,9 +121,9 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
         checkpoint.named(model).items(), checkpoint.named(model_packed).values(), strict=True
     ):
         assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
-    whole = assembly.assemble(config)
-    clip = assembly.motion(whole, "walk_3")
-    one, other = (rollouts.psi_trajectory(inference.load(which), clip)[:20] for which in (finished, "toy"))
+    experiment = assembly.assemble(config)
+    clip = assembly.motion(experiment, "walk_3")
+    one, other = (rollouts.psi_trajectory(models.load(which), clip)[:20] for which in (finished, "toy"))
     assert 0 < metrics.distance_mm(one, other).max() < 1.0
     with pytest.raises(ValueError, match=r"coat: no such folder, and no garment called so .* or a name: toy"):
         render.main(["coat", "--out", "x.png"])
@@ -119,7 +131,7 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
     for damaged in (whole_file[: size // 2], b"", whole_file[: size // 2] + b"?" + whole_file[size // 2 + 1 :]):
         (tmp_path / "toy" / "model.npz").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"model\.npz: not a whole packed model"):
-            inference.load("toy")
+            models.load("toy")
 
 
 def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_refused(finished, tmp_path):
@@ -156,7 +168,7 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     assert (other[3].pose.low <= one[3].pose.low).all() and (other[3].pose.high >= one[3].pose.high).all()
     assert (other[3].pose.low < one[3].pose.low).any() and (other[3].pose.high > one[3].pose.high).any()
     clip = assembly.motion(assembly.assemble(config), "dance_3")
-    assert np.isfinite(rollouts.psi_trajectory(inference.load(tmp_path / "out"), clip)).all()
+    assert np.isfinite(rollouts.psi_trajectory(models.load(tmp_path / "out"), clip)).all()
     with pytest.raises(ValueError, match="coat: no such folder"):
         tune.main(["coat", "--out", str(tmp_path / "out")])
     with pytest.raises(ValueError, match=r"tuning\.steps is 0"):
@@ -188,12 +200,12 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
 
 
 def test_wearers_are_thin_and_heavy_soft_and_stiff():
-    whole = assembly.assemble(Config())
-    wearers = assembly.wearers(whole)
+    experiment = assembly.assemble(Config())
+    wearers = assembly.wearers(experiment)
     assert len(wearers) == 9
 
     def size(betas):
-        return np.ptp(np.asarray(whole.body.vertices + np.asarray(whole.body.shapedirs) @ betas), axis=0)
+        return np.ptp(np.asarray(experiment.body.vertices + np.asarray(experiment.body.shapedirs) @ betas), axis=0)
 
     sizes = [size(wearers[f"{shape}, soft"][0]) for shape in ("thin", "mean", "heavy")]
     _, (low, middle, high), (thin, mean, heavy) = np.transpose(sizes)
@@ -247,25 +259,25 @@ def test_a_clip_is_played_there_and_back_and_never_left_for_the_next():
 
 def test_frame_rates_must_agree(tmp_path):
     config = Config(fps=60.0)
-    whole = assembly.assemble(config)
+    experiment = assembly.assemble(config)
     with pytest.raises(ValueError, match=r"walk_0 has 30\.0 frames a second, the experiment 60\.0"):
-        assembly.motion(whole, "walk_0")
+        assembly.motion(experiment, "walk_0")
 
 
 def test_the_body_in_reach_reaches_beyond_the_garment_without_head_or_hands():
-    whole = assembly.assemble(Config())
-    dominant = {whole.names[j] for j in np.asarray(whole.scene.body.weights).argmax(1)}
+    experiment = assembly.assemble(Config())
+    dominant = {experiment.names[j] for j in np.asarray(experiment.scene.body.weights).argmax(1)}
     assert {"Hips", "Spine", "LeftArm", "RightForeArm", "LeftUpLeg"} <= dominant
     assert not {"Head", "LeftHand", "RightHandFinger1", "LeftFoot"} & dominant
-    low = np.asarray(whole.scene.garment.vertices)[:, 1].min()
-    assert np.asarray(whole.scene.body.vertices)[:, 1].min() < low - 0.2
+    low = np.asarray(experiment.scene.garment.vertices)[:, 1].min()
+    assert np.asarray(experiment.scene.body.vertices)[:, 1].min() < low - 0.2
 
 
 def test_a_garment_elsewhere_is_refused():
-    whole = assembly.assemble(Config())
-    far = whole.garment._replace(vertices=whole.garment.vertices + 5)
+    experiment = assembly.assemble(Config())
+    far = experiment.garment._replace(vertices=experiment.garment.vertices + 5)
     with pytest.raises(ValueError, match="no part of the body is within"):
-        scene.reachable(whole.body, far, 0.35)
+        scene.reachable(experiment.body, far, 0.35)
 
 
 def test_statistics_are_those_of_all_rows_counted():
@@ -289,7 +301,7 @@ def test_statistics_are_those_of_all_rows_counted():
 def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
     """Its two-minute version, with the closed loops of a run that was hardly trained: they need not be good."""
     monkeypatch.setattr(solver, "stress", lambda *_: {})  # has tests of its own
-    monkeypatch.setattr(closed_loop, "AFTER", 20)
+    monkeypatch.setattr(stability_rollouts, "AFTER", 20)
     main([str(finished), "--quick", "--json", str(tmp_path / "s.json")])
     report = json.loads((tmp_path / "s.json").read_text())
     assert report["physics"]["configurations"] == 9000 and report["physics"]["nonfinite"] == 0
@@ -300,4 +312,4 @@ def test_the_stress_test_of_a_run(finished, tmp_path, monkeypatch, capsys):
     # a teacher of a few frames knows next to nothing, and so says Psi
     assert report["closed_loop"]["loops"]["long"]["flagged"] > 0
     assert "| long | 1000 | 0 |" in capsys.readouterr().out
-    assert Image.open(tmp_path / "s.png").width > 500
+    assert picture(tmp_path / "s.png").width > 500

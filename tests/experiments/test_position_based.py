@@ -35,17 +35,17 @@ def test_springs_are_the_membrane_when_both_are_widened():
 
 def wears(garment):
     pytest.importorskip("newton")
-    whole = assembly.assemble(dataclasses.replace(small(), garment=garment))
-    material = configured_material(whole.config)._replace(bending=jnp.zeros(()))  # or pleats unfold as they fall
-    character = characters.dress(whole.scene, jnp.zeros(10), material, whole.config.physics)
-    engine = position_based.Xpbd(whole, character, substeps=32, iterations=2)
-    return whole, engine, np.asarray(character.template, np.float64), np.asarray(character.body)
+    experiment = assembly.assemble(dataclasses.replace(small(), garment=garment))
+    material = configured_material(experiment.config)._replace(bending=jnp.zeros(()))  # or pleats unfold as they fall
+    character = characters.dress(experiment.scene, jnp.zeros(10), material, experiment.config.physics)
+    engine = position_based.Xpbd(experiment, character, substeps=32, iterations=2)
+    return experiment, engine, np.asarray(character.template, np.float64), np.asarray(character.body)
 
 
 def test_what_nothing_holds_falls():
-    whole, engine, now, body = wears("tshirt_1000")
+    experiment, engine, now, body = wears("tshirt_1000")
     new = engine.step(now, np.zeros_like(now), now, np.stack([body + [0.0, 50.0, 0.0]] * 2))
-    fallen = 0.5 * energies.GRAVITY / whole.config.fps**2 * (1 + 1 / 32)  # the implicit steps that Newton takes
+    fallen = 0.5 * energies.GRAVITY / experiment.config.fps**2 * (1 + 1 / 32)  # the implicit steps that Newton takes
     np.testing.assert_allclose(new, now - [0.0, fallen, 0.0], atol=0.01 * fallen)
 
 
@@ -58,8 +58,8 @@ def test_pinned_vertices_are_carried():
 
 
 def test_cloth_is_pushed_out_of_a_body_that_moves_into_it():
-    whole, engine, now, body = wears("skirt_1000")
-    bodies, faces = np.stack([body, body + [0.0, 0.0, 0.06]]), np.asarray(whole.scene.body.faces)
+    experiment, engine, now, body = wears("skirt_1000")
+    bodies, faces = np.stack([body, body + [0.0, 0.0, 0.06]]), np.asarray(experiment.scene.body.faces)
     deep, _ = metrics.penetration(now, bodies[1], faces)
     new = engine.step(now, np.zeros_like(now), now, bodies)
     left, _ = metrics.penetration(new, bodies[1], faces)
@@ -69,9 +69,9 @@ def test_cloth_is_pushed_out_of_a_body_that_moves_into_it():
 
 def test_friction_takes_cloth_along_with_a_body_that_slides_past():
     """A body that grows wider as it goes forwards, against the sides of a skirt."""
-    whole, engine, now, body = wears("skirt_1000")
+    experiment, engine, now, body = wears("skirt_1000")
     wider = body * [1.2, 1.0, 1.0]
-    faces = np.asarray(whole.scene.body.faces)
+    faces = np.asarray(experiment.scene.body.faces)
     deep, _ = metrics.penetration(now, wider, faces)
     aside = ~engine.pinned & (deep > 3e-3) & (np.abs(now[:, 2] - now[:, 2].mean()) < 0.05)
     still, along = (

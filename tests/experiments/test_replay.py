@@ -21,12 +21,12 @@ from experiments import replay
 def test_the_first_bad_step_is_named_and_kept(tmp_path, monkeypatch, capsys):
     config = dataclasses.replace(small(), motions=("walk_0", "run_0"))
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, restart_probability=0.0))
-    whole = assembly.assemble(config)
-    state = stage1.init(whole.scene, assembly.training_clips(whole)[0], config)
+    experiment = assembly.assemble(config)
+    state = stage1.init(experiment.scene, assembly.training_clips(experiment)[0], config)
     pool = state.pool
     # the third simulation, whose turn is the third step, stretches without bounds
     spoiled = pool.cloth._replace(velocity=pool.cloth.velocity.at[2].set(1e30))
-    frames = jnp.array([5, 60, len(assembly.motion(whole, "walk_0").translation) + 7], jnp.int32)
+    frames = jnp.array([5, 60, len(assembly.motion(experiment, "walk_0").translation) + 7], jnp.int32)
     state = state._replace(pool=pool._replace(cloth=spoiled, frame=frames, fresh=jnp.zeros(3, bool)))
     checkpoint.save(tmp_path / "stage1" / "checkpoints", 0, state, configuration.to_dict(config))
     for start in ("checkpoints", "diverged"):  # again, from what the first has kept
@@ -74,13 +74,13 @@ def test_a_finished_stage_is_not_replayed_and_a_peers_and_a_tuning_are(tmp_path,
         folder = tmp_path / run / stage / "checkpoints"
         kept = checkpoint.latest(folder)
         longer = kept.config | {stage: kept.config[stage] | {"steps": 30}}
-        update, _, like = replay._again(tmp_path / run, stage, *whole_of(kept.config))
+        update, _, like = replay._again(tmp_path / run, stage, *experiment_of(kept.config))
         state, _ = checkpoint.restore(folder, like)
         checkpoint.save(folder, 21, update(state)[0], longer)
         replay.main([str(tmp_path / run), "--stage", stage])
         assert "steps 22 to 30 of 30 do not diverge" in capsys.readouterr().out
 
 
-def whole_of(config: dict):
-    whole = assembly.assemble(configuration.from_dict(Config, config, "a checkpoint"))
-    return whole, assembly.training_clips(whole)[0]
+def experiment_of(config: dict):
+    experiment = assembly.assemble(configuration.from_dict(Config, config, "a checkpoint"))
+    return experiment, assembly.training_clips(experiment)[0]

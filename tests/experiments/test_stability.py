@@ -10,7 +10,7 @@ from toy import small
 from clothjax.physics import energies
 from clothjax.simulation import assembly
 from clothjax.types import Motion
-from experiments.stability import closed_loop, physics, solver
+from experiments.stability import physics, rollouts, solver
 from experiments.stability.report import readable
 
 
@@ -81,42 +81,42 @@ def test_the_solver_recovers_or_says_that_it_did_not():
 
 
 def test_recovery_counts_to_the_last_frame_away():
-    first = closed_loop.BEFORE - 3
+    first = rollouts.BEFORE - 3
     relative = np.ones(first + 50)
     relative[first : first + 4] = 30.0
-    assert closed_loop.recovery_frames(relative) == 4
+    assert rollouts.recovery_frames(relative) == 4
     relative[first + 20] = 1.11
-    assert closed_loop.recovery_frames(relative) == 21
-    assert closed_loop.recovery_frames(np.ones(first + 50)) == 0
+    assert rollouts.recovery_frames(relative) == 21
+    assert rollouts.recovery_frames(np.ones(first + 50)) == 0
     for lost in (np.nan, 1.2):
         relative[-1] = lost
-        assert closed_loop.recovery_frames(relative) is None
+        assert rollouts.recovery_frames(relative) is None
 
 
 def test_drift_is_that_of_the_farthest_vertex():
     track = np.zeros((3, 5, 3))
     track[2, 4, 1] = 2e-3
-    np.testing.assert_allclose(closed_loop.drift_mm(track), [0.0, 0.0, 2.0])
+    np.testing.assert_allclose(rollouts.drift_mm(track), [0.0, 0.0, 2.0])
 
 
 def test_shocks_are_at_their_frame_and_nowhere_else():
-    count = closed_loop.BEFORE + 10
+    count = rollouts.BEFORE + 10
     clip = Motion(np.tile(np.eye(3, dtype=np.float32), (count, 2, 1, 1)), np.zeros((count, 3), np.float32), 30.0)
-    shocked = closed_loop.disturbed(clip)
-    at = closed_loop.BEFORE
+    shocked = rollouts.disturbed(clip)
+    at = rollouts.BEFORE
     assert np.isnan(shocked["NaN frame"].rotations[at]).all()
     assert np.isfinite(np.delete(shocked["NaN frame"].rotations, at, axis=0)).all()
     np.testing.assert_allclose(shocked["half-turn"].rotations[at, 0], np.diag([1.0, -1, -1]))
     np.testing.assert_array_equal(np.delete(shocked["half-turn"].rotations, at, 0), np.delete(clip.rotations, at, 0))
     jump = np.diff(shocked["teleport"].translation, axis=0)[:, 0]
-    assert np.flatnonzero(jump).tolist() == [at - 1] and jump.max() == closed_loop.TELEPORT
+    assert np.flatnonzero(jump).tolist() == [at - 1] and jump.max() == rollouts.TELEPORT
 
 
 @pytest.mark.parametrize("fps", [15.0, 60.0, 90.0])
 def test_a_motion_at_another_rate_is_where_it_was_at_that_time(fps):
-    whole = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
-    clip = assembly.motion(whole, "walk_3")
-    other = closed_loop.at_rate(clip, fps)
+    experiment = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
+    clip = assembly.motion(experiment, "walk_3")
+    other = rollouts.at_rate(clip, fps)
     assert other.fps == fps
     step = round(fps / 15)
     for index in range(0, 20):
@@ -129,7 +129,7 @@ def test_a_motion_at_another_rate_is_where_it_was_at_that_time(fps):
 
 def test_a_frozen_motion_stands_still():
     clip = Motion(np.zeros((30, 1, 3, 3)), np.arange(90.0).reshape(30, 3), 30.0)
-    frozen = closed_loop.freeze(clip, 10, 5)
+    frozen = rollouts.freeze(clip, 10, 5)
     assert len(frozen.translation) == 15
     np.testing.assert_array_equal(frozen.translation[:10], clip.translation[:10])
     np.testing.assert_array_equal(frozen.translation[9:], np.tile(clip.translation[9], (6, 1)))

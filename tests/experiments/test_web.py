@@ -107,7 +107,8 @@ def test_it_shows_what_python_shows(page, garment, motion, frame, tmp_path):
     from PIL import Image
 
     Image.fromarray(expected).save(tmp_path / "python.png")
-    found = np.asarray(Image.open(tmp_path / "page.png").convert("RGB"))
+    with Image.open(tmp_path / "page.png") as page:
+        found = np.asarray(page.convert("RGB"))
 
     def cloth_and_skin(picture):
         red, _, blue = np.moveaxis(picture.astype(float), -1, 0)  # hues, for only one of the two has shadows

@@ -15,7 +15,7 @@ import clothjax as cj
 from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.inference import Layer
+from clothjax.runtime.models import Layer
 from clothjax.types import Pose
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")

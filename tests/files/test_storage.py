@@ -8,7 +8,7 @@ from samples import three_joints as _body
 from samples import two_faces as _garment
 
 from clothjax.body import plausibility
-from clothjax.files import storage
+from clothjax.files import hdf5, storage
 
 
 def _save(tmp_path, posed: bool = False):
@@ -150,7 +150,7 @@ def test_failed_write_leaves_the_old_file(tmp_path):
     with pytest.raises(ValueError):
         storage.save_body(path, _body()._replace(faces=[[0], [1, 2]]), "abc", name="b", source="t", licence="t")
     with pytest.raises(TypeError):  # fails inside HDF5, after the first datasets
-        storage._write(path, "body", {"a": np.zeros(3), "b": np.array([object()])}, name="b")
+        hdf5.write(path, "body", {"a": np.zeros(3), "b": np.array([object()])}, name="b")
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["body.h5"]
 
@@ -198,8 +198,7 @@ def test_asset_names_and_paths():
 
 
 def test_every_asset_loads():
-    body = storage.load_body("body")
-    names = storage.joint_names("body")
+    body, names = storage.load_rig("body")
     assert storage.asset_names("body") == ("body",)
     for name in storage.asset_names("garment"):
         garment = storage.load_garment(name, body)

@@ -30,11 +30,11 @@ def built(request):
     """An experiment without contact, its reel, the joints that are inputs, and the state before the first step."""
     config = settings(request.param)
     physics = dataclasses.replace(config.physics, body="none", edge_contact=False)
-    whole = assembly.assemble(dataclasses.replace(config, physics=physics))
-    reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
-    kept = psi.input_joints(whole.names, whole.config.stage2)
-    shapes = laplacian_shapes.laplacian(whole.scene, whole.config)
-    return whole, reel, kept, stage1.init_baseline(whole.scene, reel, kept, shapes, whole.config)
+    experiment = assembly.assemble(dataclasses.replace(config, physics=physics))
+    reel = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
+    kept = psi.input_joints(experiment.names, experiment.config.stage2)
+    shapes = laplacian_shapes.laplacian(experiment.scene, experiment.config)
+    return experiment, reel, kept, stage1.init_baseline(experiment.scene, reel, kept, shapes, experiment.config)
 
 
 @pytest.fixture(scope="module")
@@ -119,18 +119,20 @@ def test_the_dynamic_code_is_zero_while_nothing_moves():
 
 
 def test_facing_and_place_are_not_seen(built):
-    whole, reel, kept, state = built
-    config = whole.config
+    experiment, reel, kept, state = built
+    config = experiment.config
     betas = jnp.linspace(-1, 1, 10)
     constants = psi.constant_inputs(betas, material.configured_material(config), config.material)
     poses = motion_clips.poses(reel, jnp.int32(7))
-    memory = 0.1 * jnp.ones(animators.memory_size(whole.scene, config))
+    memory = 0.1 * jnp.ones(animators.memory_size(experiment.scene, config))
 
     @jax.jit
     def run(poses):
-        joints, parents = jnp.asarray(whole.body.joints), whole.scene.body.parents
+        joints, parents = jnp.asarray(experiment.body.joints), experiment.scene.body.parents
         seen = baselines.inputs(poses, joints, constants, parents, kept, config)
-        return baselines.network(config, len(whole.garment.vertices)).apply({"params": state.params}, memory, **seen)
+        return baselines.network(config, len(experiment.garment.vertices)).apply(
+            {"params": state.params}, memory, **seen
+        )
 
     root = int(kept[0])
     turn = jnp.asarray(about_y(1.0), jnp.float32)
@@ -140,17 +142,17 @@ def test_facing_and_place_are_not_seen(built):
 
 
 def test_gradients_pass_through_memory_over_the_whole_rollout(built):
-    whole, reel, kept, state = built
-    config = whole.config
-    character = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    experiment, reel, kept, state = built
+    config = experiment.config
+    character = characters.dress(experiment.scene, jnp.zeros(10), material.configured_material(config), config.physics)
     simulation = jax.tree.map(lambda x: x[0], state.pool)
 
     def gradient(frames):
         def loss(memory):
-            animate = animators.baseline_animator(kept)({"params": state.params}, whole.scene, character, config)
+            animate = animators.baseline_animator(kept)({"params": state.params}, experiment.scene, character, config)
             cloth = simulation.cloth._replace(latent=memory)
             total, _ = rollout.training_rollout(
-                animate, whole.scene, character, cloth, reel, simulation.frame, simulation.fresh,
+                animate, experiment.scene, character, cloth, reel, simulation.frame, simulation.fresh,
                 frames, config, weighing(config.loss, jnp.int32(0)),
             )  # fmt: skip
             return frames * total
@@ -163,11 +165,12 @@ def test_gradients_pass_through_memory_over_the_whole_rollout(built):
 
 
 def test_the_physics_trains_it(built):
-    whole, reel, kept, begun = built
+    experiment, reel, kept, begun = built
     config = dataclasses.replace(
-        whole.config, stage1=dataclasses.replace(whole.config.stage1, learning_rate=3e-3, restart_probability=0.0)
+        experiment.config,
+        stage1=dataclasses.replace(experiment.config.stage1, learning_rate=3e-3, restart_probability=0.0),
     )
-    update = stage1.make_update(whole.scene, reel, config, 3, 40, animator=animators.baseline_animator(kept))
+    update = stage1.make_update(experiment.scene, reel, config, 3, 40, animator=animators.baseline_animator(kept))
     shapes = begun.params.get("garment", {}).get("blendshapes")
     started = jax.tree.map(jnp.copy, begun)
     state, metrics = update(started)

@@ -27,17 +27,17 @@ from clothjax.simulation.assembly import Experiment
 from clothjax.training import stage1
 
 
-def features(whole: Experiment) -> Features:
+def features(experiment: Experiment) -> Features:
     """Zeros in the place of what Phi sees."""
-    clips = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
-    return stage1.blank_features(whole.scene, clips, whole.config)
+    clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
+    return stage1.blank_features(experiment.scene, clips, experiment.config)
 
 
 @pytest.fixture(scope="module")
 def toy():
     """Phi, what it sees, and its variables."""
-    whole = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
-    phi, seen = Phi(whole.config.model, whole.scene), features(whole)
+    experiment = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
+    phi, seen = Phi(experiment.config.model, experiment.scene), features(experiment)
     return phi, seen, jax.jit(phi.init)(jax.random.key(0), seen)
 
 
@@ -83,11 +83,13 @@ def test_a_block_is_exchanged_for_another(toy):
 
 
 def test_a_training_step_is_of_the_block_it_is_given():
-    whole = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
-    reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
-    state = stage1.init(whole.scene, reel, whole.config, block=Plain)
+    experiment = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
+    reel = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
+    state = stage1.init(experiment.scene, reel, experiment.config, block=Plain)
     before = jax.device_get(state.params["processor"]["0"]["node"])
-    update = stage1.make_update(whole.scene, reel, whole.config, 1, 3, animator=partial(phi_animator, block=Plain))
+    update = stage1.make_update(
+        experiment.scene, reel, experiment.config, 1, 3, animator=partial(phi_animator, block=Plain)
+    )
     state, metrics = update(state)
     assert np.isfinite(metrics["loss"]).all()
     after = state.params["processor"]["0"]["node"]
@@ -109,8 +111,8 @@ def test_a_block_alone_is_a_module(toy):
 @pytest.mark.parametrize("name", trained.shipped())
 def test_shipped_garments_have_the_names_and_shapes_of_the_modules(name):
     config, model = trained.phi(trained.folder(name))
-    whole = assembly.assemble(dataclasses.replace(config, motions=("walk_0",)))
-    ours = jax.eval_shape(Phi(config.model, whole.scene).init, jax.random.key(0), features(whole))
+    experiment = assembly.assemble(dataclasses.replace(config, motions=("walk_0",)))
+    ours = jax.eval_shape(Phi(config.model, experiment.scene).init, jax.random.key(0), features(experiment))
     theirs = checkpoint.named(model)
     assert list(checkpoint.named(ours)) == list(theirs)
     assert {n: x.shape for n, x in checkpoint.named(ours).items()} == {n: x.shape for n, x in theirs.items()}

@@ -120,22 +120,22 @@ def test_a_share_of_the_loss_is_the_vertex_error_over_the_vertices_variance(shar
 
 def test_motions_of_training_are_ordinary_though_the_teacher_did_not_play_them():
     config = dataclasses.replace(small(), motions=("walk_0", "arms_0"))
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    kept = psi.input_joints(whole.names, config.stage2)
-    rows = stage2.ordinary_poses(whole.scene, reel, kept, config)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    kept = psi.input_joints(experiment.names, config.stage2)
+    rows = stage2.ordinary_poses(experiment.scene, reel, kept, config)
     latents = np.random.default_rng(0).normal(size=(1, 7, 6)).astype(np.float32)
     teacher = Teacher(latents, rows[None, :6], np.zeros((1, 3), np.float32))
 
     def ordinary(normalizers, name):
-        poses = assembly.windows(assembly.motion(whole, name))
-        joints = skinning.shaped_joints(whole.body, jnp.zeros(10))
+        poses = assembly.windows(assembly.motion(experiment, name))
+        joints = skinning.shaped_joints(experiment.body, jnp.zeros(10))
 
         def one(frame):
             inputs = psi.window_inputs(
                 motion_clips.poses(jax.tree.map(jnp.asarray, poses), frame),
                 joints,
-                whole.body.parents,
+                experiment.body.parents,
                 kept,
                 config.fps,
             )

@@ -133,10 +133,10 @@ def test_gradients_are_finite_on_the_surface_and_on_triangles_without_area():
 
 def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     config = Config()
-    whole = assembly.assemble(config)
-    scene = whole.scene
+    experiment = assembly.assemble(config)
+    scene = experiment.scene
     character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "run_3")))
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "run_3")))
     poses = motion_clips.poses(reel, jnp.int32(40))
     window = characters.window(scene, character, poses)
     state = time_step.start(character, window, 0)
@@ -144,10 +144,13 @@ def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     planes = time_step.time_step(scene, character, state._replace(position=shaken), window, 1 / 30, config).contact
     distance = contact_search.distance(shaken, planes.point, planes.normal)
     body = skinning.pose_body(
-        whole.body, whole.body.vertices, whole.body.joints, Pose(poses.rotations[1], poses.translation[1])
+        experiment.body,
+        experiment.body.vertices,
+        experiment.body.joints,
+        Pose(poses.rotations[1], poses.translation[1]),
     )
     expected = igl.signed_distance(
-        np.asarray(shaken, np.float64), np.asarray(body, np.float64), np.asarray(whole.body.faces, np.int64),
+        np.asarray(shaken, np.float64), np.asarray(body, np.float64), np.asarray(experiment.body.faces, np.int64),
         sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
     )[0]  # fmt: skip
     np.testing.assert_allclose(distance, expected, atol=1e-5)
@@ -171,33 +174,37 @@ def bent(turns, betas):
         betas: as {number: value}.
     """
     config = Config(garment="skirt_1000")
-    whole = assembly.assemble(config)
+    experiment = assembly.assemble(config)
     betas = jnp.array([betas.get(i, 0.0) for i in range(10)])
-    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
-    rotations = np.tile(np.eye(3, dtype=np.float32), (len(whole.names), 1, 1))
+    character = characters.dress(experiment.scene, betas, material.configured_material(config), config.physics)
+    rotations = np.tile(np.eye(3, dtype=np.float32), (len(experiment.names), 1, 1))
     for joint, degrees in turns.items():
-        rotations[whole.names.index(joint)] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
+        rotations[experiment.names.index(joint)] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
     pose = Pose(jnp.asarray(rotations), jnp.zeros(3))
-    vertices = skinning.pose_body(whole.body, skinning.shaped_vertices(whole.body, betas), character.joints, pose)
-    return whole, character, pose, np.asarray(vertices, np.float64)
+    vertices = skinning.pose_body(
+        experiment.body, skinning.shaped_vertices(experiment.body, betas), character.joints, pose
+    )
+    return experiment, character, pose, np.asarray(vertices, np.float64)
 
 
-def winding(whole, vertices, positions):
+def winding(experiment, vertices, positions):
     """Winding numbers of a whole body about positions: 0 outside. They do not ask what is nearest."""
-    return igl.fast_winding_number(vertices, np.asarray(whole.body.faces, np.int64), np.asarray(positions, np.float64))
+    return igl.fast_winding_number(
+        vertices, np.asarray(experiment.body.faces, np.int64), np.asarray(positions, np.float64)
+    )
 
 
 @pytest.mark.parametrize("turns, betas", [(STOOPING, {1: -3.0}), (STOOPING, {3: -3.0}), (SQUATTING, {0: 3.0})])
 def test_nothing_is_inside_in_front_of_skin_that_is_folded_inside_out(turns, betas):
     """In groin and knees, where pseudonormals alone are wrong."""
-    whole, character, pose, vertices = bent(turns, betas)
-    scene, config = whole.scene, whole.config
+    experiment, character, pose, vertices = bent(turns, betas)
+    scene, config = experiment.scene, experiment.config
     window = characters.window(scene, character, jax.tree.map(lambda x: jnp.stack([x] * 3), pose))
     random, body = np.random.default_rng(0), np.asarray(window.current.body)
     hips_and_thighs = body[np.asarray(scene.body.joints)[np.asarray(scene.body.weights).argmax(axis=1), 1] > -0.4]
     places = hips_and_thighs[random.integers(0, len(hips_and_thighs), 10000)]
     positions = jnp.asarray(places + random.normal(0, 0.05, places.shape), jnp.float32)
-    outside = winding(whole, vertices, positions) < 0.5
+    outside = winding(experiment, vertices, positions) < 0.5
 
     def energies(distance):
         energy = 1e5 * np.maximum(-np.asarray(distance), 0) ** 3
@@ -274,10 +281,10 @@ def test_a_plane_that_stays_behind_lets_go_of_what_was_inside():
 def test_a_time_step_leaves_planes_behind():
     """A t-shirt that rests while its wearer leaps forwards by 12 cm: what the body is then not around is let go."""
     config = Config(garment="tshirt_1000")
-    whole = assembly.assemble(config)
-    scene, mesh = whole.scene, whole.scene.mesh
+    experiment = assembly.assemble(config)
+    scene, mesh = experiment.scene, experiment.scene.mesh
     character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "walk_0")))
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "walk_0")))
     poses = motion_clips.poses(reel, jnp.int32(40))
     leap = poses._replace(translation=jnp.zeros((3, 3)).at[2, 2].set(0.12))
     window = characters.window(scene, character, leap)
@@ -288,12 +295,12 @@ def test_a_time_step_leaves_planes_behind():
     planes = contact_search.find(x, body, body_next, scene.patches)
     at_edges = contact_search.find_at_edges(x, planes, mesh, body, body_next, scene.patches)
     vertices = skinning.pose_body(
-        whole.body, whole.body.vertices, whole.body.joints, Pose(leap.rotations[2], leap.translation[2])
+        experiment.body, experiment.body.vertices, experiment.body.joints, Pose(leap.rotations[2], leap.translation[2])
     )
     ends = np.asarray(x)[np.asarray(mesh.edges)]
     places = ends[:, 0] + np.asarray(at_edges.place)[:, None] * (ends[:, 1] - ends[:, 0])
     for name, where in (("collision", x), ("edge_collision", places)):
-        outside = winding(whole, np.asarray(vertices, np.float64), where) < 0.5
+        outside = winding(experiment, np.asarray(vertices, np.float64), where) < 0.5
         energies = [
             np.asarray(incremental_potential.elements(x, some, mesh, config.physics)[name])
             for some in (step._replace(contact=planes, edge_contact=at_edges), step)
@@ -362,10 +369,10 @@ def test_a_flat_body_touches_an_edge_in_its_middle_also_where_they_are_parallel(
 def test_edges_of_a_garment_touch_what_is_nearest_to_them():
     """Sought near the ends' contact, found as if the whole body had been gone through: where cloth is near a body."""
     config = Config(garment="tshirt_1000")
-    whole = assembly.assemble(config)
-    scene, mesh = whole.scene, whole.scene.mesh
+    experiment = assembly.assemble(config)
+    scene, mesh = experiment.scene, experiment.scene.mesh
     character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "run_3")))
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "run_3")))
     near = lost = 0
     for frame in (20, 40, 60):
         window = characters.window(scene, character, motion_clips.poses(reel, jnp.int32(frame)))

@@ -23,15 +23,17 @@ LONG = ("pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_t
 def test_every_configuration_takes_two_steps(path):
     config = shrink(configuration.load(Config, path))
     config = dataclasses.replace(config, motions=("walk_0",))
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
     if config.peer.network:
-        kept = psi.input_joints(whole.names, config.stage2)
-        state = stage1.init_baseline(whole.scene, reel, kept, laplacian_shapes.laplacian(whole.scene, config), config)
-        update = stage1.make_curriculum(whole.scene, reel, config, 2, animator=animators.baseline_animator(kept))
+        kept = psi.input_joints(experiment.names, config.stage2)
+        state = stage1.init_baseline(
+            experiment.scene, reel, kept, laplacian_shapes.laplacian(experiment.scene, config), config
+        )
+        update = stage1.make_curriculum(experiment.scene, reel, config, 2, animator=animators.baseline_animator(kept))
     else:
-        state = stage1.init(whole.scene, reel, config)
-        update = stage1.make_curriculum(whole.scene, reel, config, 2)
+        state = stage1.init(experiment.scene, reel, config)
+        update = stage1.make_curriculum(experiment.scene, reel, config, 2)
     before = jax.device_get(state.params)
     state, metrics = update(state)
     assert int(state.step) == 2

@@ -11,6 +11,8 @@ ROOT = Path(__file__).parents[2]
 HOST = {  # NumPy only
     "config",
     "files.configuration",
+    "files.damage",
+    "files.hdf5",
     "files.storage",
     "geometry.mesh_hierarchy",
     "geometry.topology",
@@ -168,7 +170,14 @@ def test_only_checkpoint_imports_orbax():
 
 
 def test_the_training_loop_knows_nothing_of_cloth():
-    known = {"files.checkpoint", "progress", "training.devices", "training.run_folder", "training.session"}
+    known = {
+        "files.checkpoint",
+        "files.damage",
+        "progress",
+        "training.devices",
+        "training.run_folder",
+        "training.session",
+    }
     assert reachable("clothjax.training.loop") == {f"clothjax.{name}" for name in known}
 
 

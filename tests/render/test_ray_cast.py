@@ -61,7 +61,8 @@ def test_comparison_and_webp_hold_every_picture(tmp_path):
     sheet_picture = np.asarray(Image.open(tmp_path / "c.png"))
     assert all((sheet_picture == 40 * k).all(-1).sum() >= 20 * 30 for k in range(4))
     ray_cast.webp(tmp_path / "w.webp", pictures, 30)
-    assert Image.open(tmp_path / "w.webp").n_frames == 4
+    with Image.open(tmp_path / "w.webp") as film:
+        assert film.n_frames == 4
 
 
 @pytest.fixture

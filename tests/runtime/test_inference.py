@@ -8,7 +8,7 @@ from toy import small
 
 from clothjax.files import storage
 from clothjax.networks import normalisation, psi
-from clothjax.runtime import inference, specialise
+from clothjax.runtime import inference, models, specialise
 from clothjax.simulation import assembly
 from clothjax.training import stage1, stage2
 from clothjax.types import Material, Motion, Pose
@@ -18,12 +18,12 @@ from clothjax.types import Material, Motion, Pose
 def trained():
     """A model after a few steps of both stages: its numbers mean nothing, its code paths all do."""
     config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    first, _ = stage1.make_update(whole.scene, reel, config, 1, 20)(stage1.init(whole.scene, reel, config))
-    joints = psi.input_joints(whole.names, config.stage2)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    first, _ = stage1.make_update(experiment.scene, reel, config, 1, 20)(stage1.init(experiment.scene, reel, config))
+    joints = psi.input_joints(experiment.names, config.stage2)
     phi = {"params": first.params, "statistics": first.statistics}
-    teacher, _ = stage2.teach(phi, whole.scene, reel, joints, config)
+    teacher, _ = stage2.teach(phi, experiment.scene, reel, joints, config)
     second, _ = stage2.make_update(teacher, config, 20)(stage2.init(teacher, first.params["garment"], config))
     # twelve frames of a teacher span next to nothing: as if it had seen more
     wide = normalisation.Normalizers(*(
@@ -31,12 +31,12 @@ def trained():
     ))  # fmt: skip
 
     def wearer(betas, material=None):
-        return inference.build(
-            config, whole.garment, whole.body, whole.names, second.garment, second.params, wide,
+        return models.build(
+            config, experiment.garment, experiment.body, experiment.names, second.garment, second.params, wide,
             betas=betas, material=material,
         )  # fmt: skip
 
-    clip = assembly.motion(whole, "walk_3")
+    clip = assembly.motion(experiment, "walk_3")
     motion = Motion(clip.rotations[:30], clip.translation[:30].astype(np.float32), clip.fps)
     return wearer(np.linspace(-1, 1, 10)), motion, teacher, wearer
 
@@ -65,15 +65,15 @@ def test_step_is_compiled_once_for_every_character(trained):
 
 def test_a_crowd_is_each_of_its_characters(trained):
     _, motion, _, wearer = trained
-    models = [wearer(np.full(10, 0.5 * i), Material(0.2 + 0.1 * i, 2e4, 4e4, 1e-5)) for i in range(4)]
-    crowd = inference.crowd(models)
+    wearers = [wearer(np.full(10, 0.5 * i), Material(0.2 + 0.1 * i, 2e4, 4e4, 1e-5)) for i in range(4)]
+    crowd = models.crowd(wearers)
     pose = Pose(jnp.asarray(motion.rotations[:4]), jnp.asarray(motion.translation[:4]))
     states = jax.tree.map(lambda *x: jnp.stack(x), *(
-        inference.initial_state(model, Pose(pose.rotations[i], pose.translation[i])) for i, model in enumerate(models)
+        inference.initial_state(model, Pose(pose.rotations[i], pose.translation[i])) for i, model in enumerate(wearers)
     ))  # fmt: skip
     following, together = inference.step_crowd(crowd, states, pose)
     assert np.abs(together[0] - together[3]).max() > 1e-3
-    for i, model in enumerate(models):
+    for i, model in enumerate(wearers):
         state, vertices = inference.step(model, *jax.tree.map(lambda x, i=i: x[i], (states, pose)))
         np.testing.assert_allclose(together[i], vertices, atol=1e-5)
         np.testing.assert_allclose(following.latent[i], state.latent, atol=1e-5)
@@ -84,12 +84,12 @@ def test_a_crowd_is_of_one_garment(trained):
     other = wearer(np.ones(10))
     changed = other.network._replace(shapes=2 * other.network.shapes)
     with pytest.raises(ValueError, match=r"models\[1\] differs from models\[0\] in more than its wearer"):
-        inference.crowd([model, dataclasses.replace(other, network=changed)])
+        models.crowd([model, dataclasses.replace(other, network=changed)])
     fewer = [specialise.specialise(each, blendshapes=4) for each in (model, other)]
     with pytest.raises(ValueError, match="whose blend shapes `specialise` has not fitted"):
-        inference.crowd(fewer)
+        models.crowd(fewer)
     with pytest.raises(ValueError, match="at least one"):
-        inference.crowd([])
+        models.crowd([])
 
 
 def test_a_motion_of_another_rate_or_skeleton_is_refused(trained):
@@ -112,7 +112,7 @@ def test_a_garment_that_nobody_sees_goes_on(trained):
 
 @pytest.mark.parametrize("name", ["dress", "pants", "skirt", "tshirt"])
 def test_a_garment_at_rest_can_be_left_alone(name):
-    model = inference.load(name)
+    model = models.load(name)
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
     state = inference.initial_state(model, poses[0])

@@ -15,7 +15,7 @@ from clothjax.export.onnx import run_onnx, to_onnx
 from clothjax.files import storage
 from clothjax.networks import animators
 from clothjax.physics import incremental_potential
-from clothjax.runtime import inference
+from clothjax.runtime import inference, models
 from clothjax.simulation import assembly, characters, reference, rollout, time_step
 from clothjax.simulation.scene import build_scene
 from clothjax.training import laplacian_shapes, pipeline, stage1
@@ -29,18 +29,18 @@ from experiments.benchmark.timing import cost, program
 
 
 @pytest.fixture(scope="module")
-def whole():
+def experiment():
     config = dataclasses.replace(small(), motions=("walk_0",))
     return assembly.assemble(dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1)))
 
 
 @pytest.fixture(scope="module")
-def flops(whole):
+def flops(experiment):
     """Of a frame of a training rollout in every scene, with its losses."""
-    reel = jax.tree.map(jnp.asarray, assembly.training_clips(whole)[0])
+    reel = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
     counted = {}
     for name in scenes.SCENES:
-        built = scenes.build(whole, name)
+        built = scenes.build(experiment, name)
         state = jax.eval_shape(lambda built=built: stage1.init(built.scene, reel, built.config))
 
         def loss(params, statistics, pool, clips, built=built):
@@ -70,8 +70,8 @@ def test_every_scene_costs_less_than_the_full_one(flops):
     assert flops["no_bending"] < flops["bending_weight_zero"]
 
 
-def _step(whole, pose):
-    config, built = whole.config, whole.scene
+def _step(experiment, pose):
+    config, built = experiment.config, experiment.scene
     character = characters.dress(built, jnp.zeros(10), material.configured_material(config), config.physics)
     window = characters.window(built, character, pose)
     state = time_step.start(character, window, 0)
@@ -80,8 +80,8 @@ def _step(whole, pose):
 
 
 @pytest.fixture(scope="module")
-def pose(whole):
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(whole, "walk_0")))
+def pose(experiment):
+    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "walk_0")))
     return motion_clips.poses(reel, jnp.int32(20))
 
 
@@ -95,8 +95,8 @@ def pose(whole):
         ("no_edge_contact", {"edge_collision"}),
     ],
 )
-def test_the_energies_of_a_scene(whole, pose, name, missing):
-    changed = scenes.build(whole, name)
+def test_the_energies_of_a_scene(experiment, pose, name, missing):
+    changed = scenes.build(experiment, name)
     step, _ = _step(changed, pose)
     found = incremental_potential.energies(step.position, step, changed.scene.mesh, changed.config.physics)
     assert set(found) == {
@@ -104,28 +104,30 @@ def test_the_energies_of_a_scene(whole, pose, name, missing):
     } - missing  # fmt: skip
 
 
-def test_elements_among_pinned_vertices_are_left_out_and_not_missed(whole, pose):
-    pinned = scenes.build(whole, "pinned_skirt")
+def test_elements_among_pinned_vertices_are_left_out_and_not_missed(experiment, pose):
+    pinned = scenes.build(experiment, "pinned_skirt")
     held = np.asarray(pinned.garment.pinned)
-    every, some = whole.scene.mesh, pinned.scene.mesh
+    every, some = experiment.scene.mesh, pinned.scene.mesh
     assert all(len(b) < len(a) for a, b in zip(every, some))
     assert all(not held[elements].all(axis=1).any() for elements in some)
     step, character = _step(pinned, pose)
-    np.testing.assert_allclose(character.mass, _step(whole, pose)[1].mass, rtol=1e-6)
+    np.testing.assert_allclose(character.mass, _step(experiment, pose)[1].mass, rtol=1e-6)
     new = step.position + 1e-3 * np.random.default_rng(0).standard_normal(step.position.shape).astype(np.float32)
 
     def force(step, mesh):
-        return np.asarray(jax.grad(lambda x: incremental_potential.potential(x, step, mesh, whole.config.physics))(new))
+        return np.asarray(
+            jax.grad(lambda x: incremental_potential.potential(x, step, mesh, experiment.config.physics))(new)
+        )
 
-    free = force(_step(whole, pose)[0], every)[~held]
+    free = force(_step(experiment, pose)[0], every)[~held]
     np.testing.assert_allclose(force(step, some)[~held], free, atol=1e-5 * np.abs(free).max())
 
 
-def test_a_flag_falls_from_its_pole(whole):
+def test_a_flag_falls_from_its_pole(experiment):
     """Without a body: the held edge stays where skinning puts it, the rest falls past where the body would be."""
-    flag = scenes.build(whole, "flag_on_a_pole")
+    flag = scenes.build(experiment, "flag_on_a_pole")
     config = flag.config
-    still = storage.load_motion("walk_3", whole.names)
+    still = storage.load_motion("walk_3", experiment.names)
     still = Motion(np.repeat(still.rotations[:1], 14, 0), np.repeat(still.translation[:1], 14, 0), still.fps)
     reel = jax.tree.map(jnp.asarray, assembly.windows(still))
     poses = jax.vmap(lambda t: motion_clips.poses(reel, t))(jnp.arange(1, 13))
@@ -139,14 +141,14 @@ def test_a_flag_falls_from_its_pole(whole):
     assert 0.3 < dropped.max() < 0.5 * 9.81 * (12 / 30) ** 2 + 0.05
 
 
-def test_a_still_body_refuses_a_motion(whole):
-    table = scenes.build(whole, "cloth_on_a_table")
+def test_a_still_body_refuses_a_motion(experiment):
+    table = scenes.build(experiment, "cloth_on_a_table")
     with pytest.raises(ValueError, match=r"walk_0 moves, but physics\.body is `still`"):
         assembly.motion(table, "walk_0")
 
 
-def test_one_shape_for_all_is_the_shape_it_was_modelled_in(whole):
-    config = whole.config
+def test_one_shape_for_all_is_the_shape_it_was_modelled_in(experiment):
+    config = experiment.config
     fixed = dataclasses.replace(
         config,
         stage1=dataclasses.replace(config.stage1, betas=0.0),
@@ -155,28 +157,28 @@ def test_one_shape_for_all_is_the_shape_it_was_modelled_in(whole):
     drawn = material.sample_material(jax.random.key(3), config)
 
     def total(config, betas):
-        character = dressed(whole.scene, betas, drawn, config)
+        character = dressed(experiment.scene, betas, drawn, config)
         return [jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(character._replace(betas=betas))]
 
     one = jax.jit(lambda: total(fixed, jnp.zeros(10)))()
-    configured = characters.dress(whole.scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    configured = characters.dress(experiment.scene, jnp.zeros(10), material.configured_material(config), config.physics)
     other = [jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(configured)]
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
-def test_parts_of_other_cloth_are_worn(whole):
-    low = whole.garment.vertices[:, 1] < np.median(whole.garment.vertices[:, 1])
+def test_parts_of_other_cloth_are_worn(experiment):
+    low = experiment.garment.vertices[:, 1] < np.median(experiment.garment.vertices[:, 1])
     cloth = np.where(low[:, None], [3.0, 5.0, 7.0], 1.0).astype(np.float32)
-    other = _of(whole, whole.garment._replace(cloth=cloth))
+    other = _of(experiment, experiment.garment._replace(cloth=cloth))
 
     def worn(scene):
-        config = whole.config
+        config = experiment.config
         return jax.jit(
             lambda b: characters.dress(scene, b, material.configured_material(config), config.physics)
         )(jnp.zeros(10))  # fmt: skip
 
-    plain, parted = worn(whole.scene), worn(other.scene)
-    mesh = whole.scene.mesh
+    plain, parted = worn(experiment.scene), worn(other.scene)
+    mesh = experiment.scene.mesh
     inside, outside = low[mesh.faces].all(axis=1), ~low[mesh.faces].any(axis=1)
     np.testing.assert_allclose(parted.mass, np.where(low, 3, 1) * np.asarray(plain.mass), rtol=1e-6)
     np.testing.assert_allclose(parted.rest.face_area[inside], 5 * plain.rest.face_area[inside], rtol=1e-6)
@@ -185,13 +187,13 @@ def test_parts_of_other_cloth_are_worn(whole):
     np.testing.assert_allclose(7 * parted.rest.hinge_area[bent], plain.rest.hinge_area[bent], rtol=1e-6)
 
 
-def _of(whole, garment):
+def _of(experiment, garment):
     """The same experiment with another garment."""
-    return whole._replace(garment=garment, scene=build_scene(garment, whole.body, whole.config))
+    return experiment._replace(garment=garment, scene=build_scene(garment, experiment.body, experiment.config))
 
 
-def _takes_a_step(whole):
-    state, metrics = program(*scenes.update(whole))()
+def _takes_a_step(experiment):
+    state, metrics = program(*scenes.update(experiment))()
     assert np.isfinite(metrics["loss"]).all() and not metrics["nonfinite"].any()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.pool.cloth)))
 
@@ -208,11 +210,11 @@ def _two_pieces(garment: Garment) -> Garment:
 
 
 @pytest.mark.slow
-def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
-    small = build("tshirt", 300, whole.body, whole.names)
+def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(experiment):
+    small = build("tshirt", 300, experiment.body, experiment.names)
     count = len(small.vertices)
     assert abs(count - 300) < 30
-    double = _of(whole, _two_pieces(small))
+    double = _of(experiment, _two_pieces(small))
     _takes_a_step(double)
     config = dataclasses.replace(double.config, model=dataclasses.replace(double.config.model, blendshapes=6))
     basis = laplacian_shapes.laplacian(double.scene, config).reshape(6, -1)
@@ -224,27 +226,29 @@ def test_a_garment_of_two_small_pieces_trains_and_these_move_apart(whole):
 
 
 @pytest.mark.slow
-def test_a_large_garment_trains(whole):
-    large = build("tshirt", 20000, whole.body, whole.names)
+def test_a_large_garment_trains(experiment):
+    large = build("tshirt", 20000, experiment.body, experiment.names)
     assert abs(len(large.vertices) / 20000 - 1) < 0.1
-    _takes_a_step(_of(whole, large))
+    _takes_a_step(_of(experiment, large))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", scenes.SCENES)
-def test_every_scene_trains(whole, name):
-    _takes_a_step(scenes.build(whole, name))
+def test_every_scene_trains(experiment, name):
+    _takes_a_step(scenes.build(experiment, name))
 
 
-def test_the_basis_is_the_dense_solvers(whole):
+def test_the_basis_is_the_dense_solvers(experiment):
     """Modes, and their scale, from the textbook's dense matrices."""
-    count, density, timestep = 12, whole.config.material.density, 1 / 30
-    stiffness = 0.25 * 4.7e-4 * (2 * whole.config.material.mu + whole.config.material.lam)
-    config = dataclasses.replace(whole.config, model=dataclasses.replace(whole.config.model, blendshapes=count))
-    basis = laplacian_shapes.laplacian(whole.scene, config)[::3, :, 0]
-    vertices = np.asarray(whole.garment.vertices, np.float64)
+    count, density, timestep = 12, experiment.config.material.density, 1 / 30
+    stiffness = 0.25 * 4.7e-4 * (2 * experiment.config.material.mu + experiment.config.material.lam)
+    config = dataclasses.replace(
+        experiment.config, model=dataclasses.replace(experiment.config.model, blendshapes=count)
+    )
+    basis = laplacian_shapes.laplacian(experiment.scene, config)[::3, :, 0]
+    vertices = np.asarray(experiment.garment.vertices, np.float64)
     matrix, mass = np.zeros((len(vertices),) * 2), np.zeros(len(vertices))
-    for face in whole.garment.faces:
+    for face in experiment.garment.faces:
         a, b, c = vertices[face]
         mass[face] += density * np.linalg.norm(np.cross(b - a, c - a)) / 6
         for i, j in zip(face, np.roll(face, 1)):
@@ -274,7 +278,7 @@ def test_a_flag_goes_all_the_way(tmp_path):
     assert report["psi"]["finite"] and "penetration_percent" not in report["psi"]
     render.main([str(tmp_path), "--motions", "walk_3", "--out", str(tmp_path / "flag.webp"), "--frames", "3"])
     render.main([str(tmp_path), "--motions", "walk_3", "--out", str(tmp_path / "flag.glb"), "--frames", "3"])
-    model = inference.load(tmp_path)
+    model = models.load(tmp_path)
     clip = storage.load_motion("walk_3", assembly.assemble(config).names)
     clip = Motion(clip.rotations[:20], clip.translation[:20].astype(np.float32), clip.fps)
     vertices, _ = inference.animate(model, clip)

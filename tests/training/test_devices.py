@@ -132,16 +132,16 @@ from clothjax.simulation import assembly
 from clothjax.training import devices, stage1, stage2
 
 config = configuration.cli(Config, [sys.argv[1]])
-whole = assembly.assemble(config)
-reel, _ = assembly.training_clips(whole)
+experiment = assembly.assemble(config)
+reel, _ = assembly.training_clips(experiment)
 after, teachers = [], []
 for mesh in (None, devices.choose("auto", config.stage1.batch)):
-    state = devices.replicate(stage1.init(whole.scene, reel, config), mesh)
-    state, metrics = stage1.make_update(whole.scene, reel, config, 1, 1, mesh)(state)
+    state = devices.replicate(stage1.init(experiment.scene, reel, config), mesh)
+    state, metrics = stage1.make_update(experiment.scene, reel, config, 1, 1, mesh)(state)
     after.append(jax.device_get((state.params, state.pool.cloth, metrics["loss"])))
     first = jax.device_get({"params": state.params, "statistics": state.statistics}) if mesh is None else first
     model = devices.replicate(first, mesh)
-    teacher = stage2.teach(model, whole.scene, reel, np.arange(5), config, device_mesh=mesh)[0]
+    teacher = stage2.teach(model, experiment.scene, reel, np.arange(5), config, device_mesh=mesh)[0]
     teachers.append(teacher._replace(latents=teacher.latents[:, :3]))  # later frames have amplified the rounding
 print(len(jax.devices()), "devices")
 for one, four in zip(jax.tree.leaves(after[0]), jax.tree.leaves(after[1]), strict=True):

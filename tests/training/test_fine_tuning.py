@@ -13,7 +13,7 @@ from clothjax.body import motion_clips
 from clothjax.config import Config, LossConfig, Ramp, TuningConfig
 from clothjax.networks import animators, normalisation
 from clothjax.networks.normalisation import Normalizers, Scale
-from clothjax.runtime import inference
+from clothjax.runtime import inference, models
 from clothjax.simulation import assembly, characters
 from clothjax.simulation.rollout import StepInput
 from clothjax.training import fine_tuning, stage1
@@ -30,12 +30,12 @@ def toy():
 
 
 def test_psi_in_training_is_psi_in_use(toy):
-    whole, _, kept, garment, predictor, normalizers = toy
-    config, betas = whole.config, jnp.linspace(-1, 1, 10)
-    model = inference.build(
-        config, whole.garment, whole.body, whole.names, garment, predictor, normalizers, betas=betas
+    experiment, _, kept, garment, predictor, normalizers = toy
+    config, betas = experiment.config, jnp.linspace(-1, 1, 10)
+    model = models.build(
+        config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers, betas=betas
     )
-    clip = assembly.motion(whole, "walk_0")
+    clip = assembly.motion(experiment, "walk_0")
     pose = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(5)]
     state = inference.initial_state(model, pose[0])
     for t in range(3):
@@ -44,10 +44,12 @@ def test_psi_in_training_is_psi_in_use(toy):
     at_bounds = np.isclose(np.abs(following.latent), 0.1)
     assert at_bounds.any() and not at_bounds.all() and not following.ok
 
-    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
-    animate = animators.psi_animator(garment, normalizers, kept)({"params": predictor}, whole.scene, character, config)
+    character = characters.dress(experiment.scene, betas, material.configured_material(config), config.physics)
+    animate = animators.psi_animator(garment, normalizers, kept)(
+        {"params": predictor}, experiment.scene, character, config
+    )
     around = motion_clips.poses(jax.tree.map(jnp.asarray, assembly.windows(clip)), 2)
-    window = characters.window(whole.scene, character, around)
+    window = characters.window(experiment.scene, character, around)
     code = normalisation.denormalise(normalizers.latent, state.latent)
     cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code, 0 * code)
     new, latent, seen = jax.jit(lambda c: animate.step(StepInput(c, around, window, None, None)))(cloth)
@@ -57,30 +59,30 @@ def test_psi_in_training_is_psi_in_use(toy):
 
 
 def test_tuning_lowers_the_energy_and_changes_nothing_but_the_predictor(toy):
-    whole, reel, kept, garment, predictor, normalizers = toy
+    experiment, reel, kept, garment, predictor, normalizers = toy
     normalizers = Normalizers(*(
         Scale(jnp.zeros(n), jnp.ones(n), jnp.full(n, -1e6), jnp.full(n, 1e6))
         for n in (len(normalizers.latent.mean), len(normalizers.pose.mean))
     ))  # fmt: skip
-    config = fine_tuning.settings(whole.config)
-    state = fine_tuning.init(predictor, whole.scene, reel, whole.config)
+    config = fine_tuning.settings(experiment.config)
+    state = fine_tuning.init(predictor, experiment.scene, reel, experiment.config)
     assert jax.tree.structure(state.params) == jax.tree.structure(predictor) and not state.statistics
     update = stage1.make_update(
-        whole.scene, reel, config, 1, 40, animator=animators.psi_animator(garment, normalizers, kept)
+        experiment.scene, reel, config, 1, 40, animator=animators.psi_animator(garment, normalizers, kept)
     )
     state, metrics = update(state)
     assert np.isfinite(metrics["loss"]).all() and int(state.step) == 40
     # the same simulations once more, by the predictor that they have trained
-    _, again = update(fine_tuning.init(state.params, whole.scene, reel, whole.config))
+    _, again = update(fine_tuning.init(state.params, experiment.scene, reel, experiment.config))
     assert np.mean(again["loss"]) < 0.95 * np.mean(metrics["loss"])
 
 
 def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
-    whole, reel, kept, garment, predictor, normalizers = toy
-    config, betas = whole.config, jnp.linspace(-1, 1, 10)
-    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
+    experiment, reel, kept, garment, predictor, normalizers = toy
+    config, betas = experiment.config, jnp.linspace(-1, 1, 10)
+    character = characters.dress(experiment.scene, betas, material.configured_material(config), config.physics)
     poses = motion_clips.poses(reel, 5)
-    window = characters.window(whole.scene, character, poses)
+    window = characters.window(experiment.scene, character, poses)
     size = len(normalizers.latent.mean)
     root = np.random.default_rng(0).normal(size=(size, size))
     inverse = root @ root.T + np.eye(size)
@@ -95,7 +97,7 @@ def test_the_gradient_of_a_code_is_preconditioned_and_nothing_else_changes(toy):
 
         def energy(bias):
             params = predictor | {last: predictor[last] | {"bias": bias}}
-            new, code, _ = make({"params": params}, whole.scene, character, config).step(
+            new, code, _ = make({"params": params}, experiment.scene, character, config).step(
                 StepInput(cloth, poses, window, None, None)
             )
             return jnp.sum((new - 1.0) ** 2), code
@@ -136,11 +138,11 @@ def test_preconditioned_gradients_point_to_the_minimum():
 
 
 def test_the_first_layer_learns_from_preconditioned_poses_and_predicts_from_poses(toy):
-    whole, reel, kept, garment, predictor, normalizers = toy
-    config, betas = whole.config, jnp.linspace(-1, 1, 10)
-    character = characters.dress(whole.scene, betas, material.configured_material(config), config.physics)
+    experiment, reel, kept, garment, predictor, normalizers = toy
+    config, betas = experiment.config, jnp.linspace(-1, 1, 10)
+    character = characters.dress(experiment.scene, betas, material.configured_material(config), config.physics)
     poses = motion_clips.poses(reel, 5)
-    window = characters.window(whole.scene, character, poses)
+    window = characters.window(experiment.scene, character, poses)
     size, count = len(normalizers.latent.mean), len(normalizers.pose.mean)
     matrix = jnp.asarray(np.random.default_rng(0).normal(size=(count, count)), jnp.float32)
     cloth = ClothState(*(jnp.zeros_like(character.template) for _ in range(3)), *(jnp.zeros(size) for _ in range(2)))
@@ -150,7 +152,7 @@ def test_the_first_layer_learns_from_preconditioned_poses_and_predicts_from_pose
         make = animators.psi_animator(garment, normalizers, kept, gradients)
 
         def energy(params):
-            new, code, _ = make({"params": params}, whole.scene, character, config).step(
+            new, code, _ = make({"params": params}, experiment.scene, character, config).step(
                 StepInput(cloth, poses, window, None, None)
             )
             return jnp.sum((new - 1.0) ** 2), code

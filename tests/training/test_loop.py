@@ -93,11 +93,9 @@ def straight(tmp_path_factory):
 
 
 def test_training_records_what_it_did(tmp_path, capsys):
-    fitted = train(tmp_path, evaluate=lambda state: {"w0": state.params["w"][0]}, evaluate_steps=20)
+    fitted = train(tmp_path)
     written = rows(tmp_path)
     assert [row["step"] for row in written] == list(range(4, 41, 4))
-    assert [row["step"] for row in written if "w0" in row] == [20, 40]
-    assert written[-1]["w0"] == float(fitted.state.params["w"][0])
     _, metrics = make_update(40)(initial())
     for row in written:
         losses = np.asarray(metrics["loss"])[row["step"] - 4 : row["step"]]

@@ -22,9 +22,9 @@ def test_the_descent_goes_further_with_the_hessian_of_cloth_that_is_worn():
         motions=("walk_0",),
         model=dataclasses.replace(config.model, descent_samples=8, descent_steps=6, latent=128, blendshapes=100),
     )
-    whole = assembly.assemble(config)
-    scene = whole.scene
-    reel, _ = assembly.training_clips(whole)
+    experiment = assembly.assemble(config)
+    scene = experiment.scene
+    reel, _ = assembly.training_clips(experiment)
     state = stage1.init(scene, reel, config)
     model = {"params": state.params, "statistics": state.statistics}
     inverse = preconditioner.measure(model, scene, reel, config)
@@ -66,8 +66,8 @@ def test_loops_that_all_blow_up_are_reported():
         model=dataclasses.replace(config.model, descent_samples=1),
         material=dataclasses.replace(config.material, mu_range=Range(1e30, 1e30)),
     )
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    state = stage1.init(whole.scene, reel, config)
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    state = stage1.init(experiment.scene, reel, config)
     with pytest.raises(ValueError, match="no rollout of an untrained Phi stayed finite"):
-        preconditioner.measure({"params": state.params, "statistics": state.statistics}, whole.scene, reel, config)
+        preconditioner.measure({"params": state.params, "statistics": state.statistics}, experiment.scene, reel, config)

@@ -17,41 +17,40 @@ from clothjax.training import laplacian_shapes, principal_shapes, sampling
 def skirt():
     config = dataclasses.replace(small(), garment="skirt_1000", motions=("walk_0",))
     config = dataclasses.replace(config, shapes=ShapesConfig(sequences=2, frames=5, descent_steps=6))
-    whole = assembly.assemble(config)
-    return whole, assembly.training_clips(whole)[0]
+    experiment = assembly.assemble(config)
+    return experiment, assembly.training_clips(experiment)[0]
 
 
-def of(whole, **changed):
-    return dataclasses.replace(whole.config, model=dataclasses.replace(whole.config.model, **changed))
+def of(experiment, **changed):
+    return dataclasses.replace(experiment.config, model=dataclasses.replace(experiment.config.model, **changed))
 
 
 def test_cloth_hangs_from_its_pins(skirt):
-    whole, reel = skirt
+    experiment, reel = skirt
     done = []
-    frames = principal_shapes.simulate(whole.scene, reel, whole.config, done.append)
-    assert frames.shape == (2, 5, len(whole.garment.vertices), 3) and done[-1] == 2
-    pinned = np.asarray(whole.garment.pinned)
+    frames = principal_shapes.simulate(experiment.scene, reel, experiment.config, done.append)
+    assert frames.shape == (2, 5, len(experiment.garment.vertices), 3) and done[-1] == 2
+    pinned = np.asarray(experiment.garment.pinned)
     assert np.abs(frames[:, :, pinned]).max() < 1e-4
-    low = whole.garment.vertices[:, 1] < np.quantile(whole.garment.vertices[:, 1], 0.3)
+    low = experiment.garment.vertices[:, 1] < np.quantile(experiment.garment.vertices[:, 1], 0.3)
     moved = np.linalg.norm(frames[:, :, low], axis=-1)
     assert 1e-3 < moved.mean() < 0.1
 
 
-def test_the_components_span_what_was_simulated(skirt, monkeypatch):
-    whole, reel = skirt
+def test_the_components_span_what_was_simulated(skirt):
+    experiment, _ = skirt
     random = np.random.default_rng(0)
-    count = len(whole.garment.vertices)
+    count = len(experiment.garment.vertices)
     true = random.normal(size=(3, 3 * count))
     frames = (random.normal(size=(8, 3)) * [5.0, 2.0, 1.0] @ true).reshape(2, 4, count, 3)
-    monkeypatch.setattr(principal_shapes, "simulate", lambda *_: frames)
-    shapes = principal_shapes.principal(whole.scene, reel, of(whole, blendshapes=12))
+    shapes = principal_shapes.principal(frames, experiment.scene, of(experiment, blendshapes=12))
     assert shapes.shape == (12, count, 3)
     first = shapes[:3].reshape(3, -1).astype(np.float64)
     weights = np.linalg.lstsq(first.T, frames.reshape(8, -1).T, rcond=None)[0]
     np.testing.assert_allclose(first.T @ weights, frames.reshape(8, -1).T, atol=1e-3)
     np.testing.assert_array_equal(shapes[8:], 0.0)  # of eight frames
     # as large as smooth shapes: each costs 1 J
-    network = laplacian_shapes.springs(whole.scene, whole.config)
+    network = laplacian_shapes.springs(experiment.scene, experiment.config)
     for shape in first.reshape(3, count, 3)[:, network.free]:
         assert np.trace(shape.T @ (network.matrix @ shape)) == pytest.approx(1.0, rel=1e-5)
     # the largest comes first
@@ -59,17 +58,17 @@ def test_the_components_span_what_was_simulated(skirt, monkeypatch):
 
 
 def test_what_blew_up_is_left_out(skirt, monkeypatch):
-    whole, reel = skirt
-    found = np.zeros((2, 5, len(whole.garment.vertices), 3), np.float32)
+    experiment, reel = skirt
+    found = np.zeros((2, 5, len(experiment.garment.vertices), 3), np.float32)
     found[1, 3, 7, 0] = np.nan
     monkeypatch.setattr(sampling, "sample", lambda *_: found)
-    assert len(principal_shapes.simulate(whole.scene, reel, whole.config)) == 1
+    assert len(principal_shapes.simulate(experiment.scene, reel, experiment.config)) == 1
     found[0, 0, 0, 0] = 9.0
     with pytest.raises(ValueError, match="look at the garment on the body"):
-        principal_shapes.simulate(whole.scene, reel, whole.config)
+        principal_shapes.simulate(experiment.scene, reel, experiment.config)
     monkeypatch.setattr(principal_shapes, "MAX_VERTICES", 1000)
     with pytest.raises(ValueError, match=r"shapes\.sequences: 0"):
-        principal_shapes.simulate(whole.scene, reel, whole.config)
+        principal_shapes.simulate(experiment.scene, reel, experiment.config)
 
 
 def test_sampling_gives_each_key_its_own_and_all_of_them():

@@ -20,24 +20,24 @@ from clothjax.training.loss import weighing
 def toy():
     config = dataclasses.replace(small(), motions=("walk_0", "dance_0"))
     config = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, steps=400, lost=5e3))
-    whole = assembly.assemble(config)
-    reel, _ = assembly.training_clips(whole)
-    return whole, reel
+    experiment = assembly.assemble(config)
+    reel, _ = assembly.training_clips(experiment)
+    return experiment, reel
 
 
 @pytest.fixture(scope="module")
 def update(toy):
     """One step a call: the program that takes longest to compile, for all tests."""
-    whole, reel = toy
-    return stage1.make_update(whole.scene, reel, whole.config, 1, 1)
+    experiment, reel = toy
+    return stage1.make_update(experiment.scene, reel, experiment.config, 1, 1)
 
 
 def test_a_killed_and_resumed_training_ends_bit_for_bit_like_one_that_was_not(toy, update, tmp_path):
-    whole, reel = toy
-    config = whole.config
+    experiment, reel = toy
+    config = experiment.config
 
     def run(folder, steps):
-        state = stage1.init(whole.scene, reel, config)
+        state = stage1.init(experiment.scene, reel, config)
         kept = configuration.to_dict(config)
         return loop.fit(update, state, steps=steps, steps_per_call=1, directory=tmp_path / folder, config=kept).state
 
@@ -50,8 +50,8 @@ def test_a_killed_and_resumed_training_ends_bit_for_bit_like_one_that_was_not(to
 
 
 def test_training_lowers_the_loss_it_is_given(toy, update):
-    whole, reel = toy
-    state = stage1.init(whole.scene, reel, whole.config)
+    experiment, reel = toy
+    state = stage1.init(experiment.scene, reel, experiment.config)
     losses_seen = []
     for _ in range(400):
         state, metrics = update(state)
@@ -60,8 +60,8 @@ def test_training_lowers_the_loss_it_is_given(toy, update):
 
 
 def test_a_step_with_a_nonfinite_gradient_changes_nothing_but_its_count(toy, update):
-    whole, reel = toy
-    state = stage1.init(whole.scene, reel, whole.config)
+    experiment, reel = toy
+    state = stage1.init(experiment.scene, reel, experiment.config)
     broken = state._replace(pool=state.pool._replace(betas=state.pool.betas.at[0].set(jnp.nan)))
     before = jax.device_get((broken.params, broken.average, broken.optimizer, broken.statistics))
     after, metrics = update(broken)
@@ -70,9 +70,9 @@ def test_a_step_with_a_nonfinite_gradient_changes_nothing_but_its_count(toy, upd
 
 
 def test_a_simulation_whose_energy_tells_that_it_is_lost_is_begun_anew(toy, update):
-    whole, reel = toy
-    highest = whole.config.stage1.lost
-    state = stage1.init(whole.scene, reel, whole.config)
+    experiment, reel = toy
+    highest = experiment.config.stage1.lost
+    state = stage1.init(experiment.scene, reel, experiment.config)
     pool = state.pool._replace(fresh=jnp.zeros_like(state.pool.fresh))
     usual, metrics = update(jax.tree.map(jnp.array, state._replace(pool=pool)))
     assert not metrics["lost"][0] and float(metrics["loss"][0]) < highest
@@ -83,12 +83,12 @@ def test_a_simulation_whose_energy_tells_that_it_is_lost_is_begun_anew(toy, upda
     after, metrics = update(state._replace(pool=torn))
     assert metrics["lost"][0] and float(metrics["loss"][0]) > highest and np.isfinite(metrics["loss"][0])
     again = after._replace(step=jnp.int32(0))  # its next turn
-    _, begun = stage1.next_batch(again, whole.scene, jax.tree.map(jnp.asarray, reel), 1, whole.config)
+    _, begun = stage1.next_batch(again, experiment.scene, jax.tree.map(jnp.asarray, reel), 1, experiment.config)
     assert np.abs(begun.betas[0] - betas).max() > 0
 
 
-def _play(whole, reel, params, motion, advance_turn):
-    scene, config = whole.scene, whole.config
+def _play(experiment, reel, params, motion, advance_turn):
+    scene, config = experiment.scene, experiment.config
     moved = motion._replace(
         rotations=np.concatenate([np.einsum("ab,tbc->tac", advance_turn, motion.rotations[:, 0])[:, None],
                                   motion.rotations[:, 1:]], axis=1).astype(np.float32),
@@ -104,20 +104,20 @@ def _play(whole, reel, params, motion, advance_turn):
 
 
 def test_phi_does_not_see_place_or_heading(toy, update):
-    whole, reel = toy
-    state = stage1.init(whole.scene, reel, whole.config)
+    experiment, reel = toy
+    state = stage1.init(experiment.scene, reel, experiment.config)
     for _ in range(20):
         state, _ = update(state)
     model = {"params": state.params, "statistics": state.statistics}
-    motion = assembly.motion(whole, "walk_0")
+    motion = assembly.motion(experiment, "walk_0")
     angle = 1.1
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    plain, root = _play(whole, reel, model, motion, np.eye(3))
+    plain, root = _play(experiment, reel, model, motion, np.eye(3))
     far = motion._replace(translation=motion.translation + np.array([1000.0, 0.0, -500.0]))
-    elsewhere, _ = _play(whole, reel, model, far, np.eye(3))
+    elsewhere, _ = _play(experiment, reel, model, far, np.eye(3))
     np.testing.assert_allclose(elsewhere, plain, atol=2e-5)
     turned = motion._replace(translation=motion.translation @ turn.T)
-    heading, _ = _play(whole, reel, model, turned, turn)
+    heading, _ = _play(experiment, reel, model, turned, turn)
     # The root joint, about which the body turns, is not at the origin. A turned body differs by rounding, 3e-7 m. From
     # the second frame on a choice of the line search may fall otherwise: 3e-5 m there and 2e-4 m in the eighth were
     # seen, over four seeds, as much as from a rounding of the poses alone.
@@ -126,30 +126,30 @@ def test_phi_does_not_see_place_or_heading(toy, update):
     np.testing.assert_allclose(difference[:8], 0.0, atol=5e-4)
 
 
-def _untrained(whole, reel):
+def _untrained(experiment, reel):
     """A first training state, one of its simulations and who is in it."""
-    state = stage1.init(whole.scene, reel, whole.config)
+    state = stage1.init(experiment.scene, reel, experiment.config)
     one = jax.tree.map(lambda x: x[0], state.pool)
-    return state, one, characters.dress(whole.scene, one.betas, one.material, whole.config.physics)
+    return state, one, characters.dress(experiment.scene, one.betas, one.material, experiment.config.physics)
 
 
-def _phi(whole, state, params, character):
+def _phi(experiment, state, params, character):
     return animators.phi_animator(
-        {"params": params, "statistics": state.statistics}, whole.scene, character, whole.config
+        {"params": params, "statistics": state.statistics}, experiment.scene, character, experiment.config
     )
 
 
 def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
-    whole, reel = toy
-    config, scene = whole.config, whole.scene
-    state, one, character = _untrained(whole, reel)
+    experiment, reel = toy
+    config, scene = experiment.config, experiment.scene
+    state, one, character = _untrained(experiment, reel)
     reel = jax.tree.map(jnp.asarray, reel)
 
     @jax.jit
     def one_update(state, cloth):
         return rollout.training_rollout(
-            _phi(whole, state, state.params, character), scene, character, cloth, reel, one.frame, jnp.asarray(True),
-            1, config, weighing(config.loss, state.step),
+            _phi(experiment, state, state.params, character), scene, character, cloth, reel, one.frame,
+            jnp.asarray(True), 1, config, weighing(config.loss, state.step),
         )  # fmt: skip
 
     _, (cloth, terms, _) = one_update(state, one.cloth)
@@ -166,9 +166,9 @@ def test_a_fresh_simulation_takes_its_quasi_static_step_standing_still(toy):
 
 @pytest.mark.slow
 def test_gradients_go_through_as_many_frames_as_configured(toy):
-    whole, reel = toy
-    config, scene = whole.config, whole.scene
-    state, one, character = _untrained(whole, reel)
+    experiment, reel = toy
+    config, scene = experiment.config, experiment.scene
+    state, one, character = _untrained(experiment, reel)
     reel = jax.tree.map(jnp.asarray, reel)
 
     def gradient(frames):
@@ -176,8 +176,8 @@ def test_gradients_go_through_as_many_frames_as_configured(toy):
 
         def loss(params):
             return rollout.training_rollout(
-                _phi(whole, state, params, character), scene, character, one.cloth, reel, one.frame, jnp.asarray(False),
-                2, dataclasses.replace(config, stage1=stage), weighing(config.loss, state.step),
+                _phi(experiment, state, params, character), scene, character, one.cloth, reel, one.frame,
+                jnp.asarray(False), 2, dataclasses.replace(config, stage1=stage), weighing(config.loss, state.step),
             )[0]  # fmt: skip
 
         value, gradients = jax.jit(jax.value_and_grad(loss))(state.params)

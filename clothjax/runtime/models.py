@@ -1,0 +1,266 @@
+"""The model that `inference` runs: Psi on one character, built from what training left.
+
+A model belongs to one character: betas and material decide `Model.wearer`, and a crowd shares everything else.
+`clothjax.runtime.specialise.specialise` makes it smaller and faster; it then runs through the same functions.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.body import skinning
+from clothjax.config import Config
+from clothjax.files import storage
+from clothjax.networks import normalisation, psi
+from clothjax.networks.normalisation import Normalizers
+from clothjax.runtime import trained
+from clothjax.types import Array, Body, Garment, Material
+
+
+class Layer(NamedTuple):
+    """A dense layer."""
+
+    kernel: Array  # [inputs, outputs]
+    bias: Array  # [outputs]
+
+
+class FoldedLayer(NamedTuple):
+    """What a specialised model keeps of a layer that reads the code: the bias alone.
+
+    The state of such a model carries the code's products with the kernels of these layers in place of the code
+    (`specialise.without_code`).
+    """
+
+    bias: Array  # [outputs]
+
+
+class Bounds(NamedTuple):
+    """The range of inputs or codes in training; values are clipped to it."""
+
+    low: Array
+    high: Array
+    slack: Array
+
+
+class Network(NamedTuple):
+    """The arrays of Psi that all characters share: latent predictor, decoder, blend shapes, skinning weights.
+
+    P counts pose inputs, H the predictor's first hidden layer, D the decoder's first layer. C counts what the state
+    carries: the code, C = L, or its products with the layers that read it, if the model is specialised.
+    """
+
+    pose: Array  # [P, H] kernel of the predictor's first layer
+    pose_mean: Array  # [P] mean of the inputs, subtracted first
+    pose_bounds: Bounds  # [P] of the centred inputs
+    code: Layer | FoldedLayer  # [C, H] of the same layer, without the character's part of the bias
+    hidden: tuple[Layer, ...]  # of the predictor, the last of which gives [C]
+    code_bounds: Bounds  # [C]
+    first: Array  # [C] the code before the first frame
+    read: Layer | FoldedLayer  # [C, D] the decoder's first layer; with a skip [C, D + K], the last K being the skip
+    decoder: tuple[Layer, ...]  # the decoder's other layers, to [K]
+    mix: Layer | None  # [K, K'] from the decoder's weights to those of fewer shapes
+    shapes: Array  # [K, 3 V] m, or [K', 3 V], the x of all vertices first; zero where they are pinned
+    weights: Array  # [J', V] skinning weights of the joints `Model.moving`
+
+    @property
+    def folded(self) -> bool:
+        """True if `specialise` has folded the code into the layers around it."""
+        return isinstance(self.code, FoldedLayer)
+
+    @property
+    def width(self) -> int:
+        """Outputs [D] of the decoder's first layer; further outputs of `read` are the skip."""
+        return len(self.decoder[0].kernel)
+
+
+class Wearer(NamedTuple):
+    """The arrays of a model that depend on its character: on betas and material."""
+
+    bias: Array  # [H] added to the predictor's first layer
+    template: Array  # [3, V] m, the shaped garment in the canonical pose
+    joints: Array  # [J, 3] m of the shaped body
+    known: Array  # bool, True if the character is within the range of training
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("network", "wearer", "faces"),
+    meta_fields=("names", "parents", "input_joints", "moving", "config"),
+)
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A trained Psi on one character, ready to run: a pytree whose other fields are static."""
+
+    network: Network
+    wearer: Wearer  # of a crowd, with a leading axis [N]
+    faces: Array  # [F, 3] int32
+    names: tuple[str, ...]  # of the joints
+    parents: tuple[int, ...]
+    input_joints: tuple[int, ...]  # joints whose pose is an input
+    moving: tuple[int, ...]  # joints that move the garment
+    config: Config
+
+
+class State(NamedTuple):
+    """What a model carries from frame to frame."""
+
+    latent: Array  # [C] the code, in standard deviations; of a folded model its products with the layers that read it
+    rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
+    positions: Array  # [2, J, 3] m of their joints, from the root's canonical place
+    translation: Array  # [2, 3] m
+    ok: Array  # bool, True if the last frame was within the range of training
+
+
+def build(
+    config: Config,
+    garment: Garment,
+    body: Body,
+    names: tuple[str, ...],
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    *,
+    betas: Array | None = None,
+    material: Material | None = None,
+) -> Model:
+    """Build the model of one character from what training gave.
+
+    Scales and constants of the inputs are folded into the layers that read them.
+
+    Args:
+        garment, body, names: as loaded by `storage`; names [J] of the joints.
+        garment_params: parameters of the decoder with its blend shapes.
+        predictor: parameters of the latent predictor.
+        normalizers: scales of its codes and pose inputs.
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: for betas of another shape than the body's.
+    """
+    betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
+    if betas.shape != (body.shapedirs.shape[-1],):
+        raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
+    cloth = config.material
+    constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
+    material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
+    network, wearer = _arrays(garment, body, garment_params, predictor, normalizers, betas, material, config)
+    return Model(
+        network=network,
+        wearer=wearer,
+        faces=jnp.asarray(garment.faces),
+        names=tuple(names),
+        parents=tuple(int(p) for p in body.parents),
+        input_joints=tuple(int(joint) for joint in psi.input_joints(names, config.stage2)),
+        moving=tuple(range(len(names))),
+        config=config,
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def _arrays(
+    garment: Garment,
+    body: Body,
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers,
+    betas: Array,
+    material: Material,
+    config: Config,
+) -> tuple[Network, Wearer]:
+    """Build the arrays of a model in one compiled program, which starts faster than many small ones."""
+    constants, known = psi.bounded_constants(psi.constant_inputs(betas, material, config.material), config)
+    latent, pose = normalizers
+    size = len(latent.mean)
+    first, *hidden = _layers(predictor)
+    of_code, of_pose, of_constants = jnp.split(first.kernel, [size, size + len(pose.mean)])
+    read, *decoder = _layers(garment_params["decoder"])
+    if config.model.decoder_skip:
+        skip = jnp.asarray(garment_params["skip"])
+        read = Layer(jnp.concatenate([read.kernel, skip], axis=1), jnp.pad(read.bias, (0, skip.shape[1])))
+    shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
+    network = Network(
+        pose=of_pose / pose.deviation[:, None],
+        pose_mean=pose.mean,
+        pose_bounds=Bounds(
+            pose.low * pose.deviation, pose.high * pose.deviation, jnp.full(len(pose.mean), normalisation.SLACK)
+        ),
+        code=Layer(of_code, first.bias),
+        hidden=tuple(hidden),
+        code_bounds=Bounds(latent.low, latent.high, jnp.full(size, normalisation.CODE_SLACK)),
+        first=-latent.mean / latent.deviation,
+        read=Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel),
+        decoder=tuple(decoder),
+        mix=None,
+        shapes=jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1),
+        weights=jnp.asarray(garment.weights).T,
+    )
+    wearer = Wearer(
+        bias=constants @ of_constants,
+        template=skinning.shaped_vertices(garment, betas).T,
+        joints=skinning.shaped_joints(body, betas),
+        known=known,
+    )
+    return network, wearer
+
+
+def _layers(mlp: dict) -> list[Layer]:
+    layers = (mlp[f"dense_{i}"] for i in range(len(mlp)))
+    return [Layer(jnp.asarray(layer["kernel"]), jnp.asarray(layer["bias"])) for layer in layers]
+
+
+def crowd(models: Sequence[Model]) -> Model:
+    """Build one model of many characters in the same garment, for `step_crowd`.
+
+    Args:
+        models: of different characters, otherwise the same.
+
+    Raises:
+        ValueError: if there is none, or one differs from the first in more than its character.
+    """
+    if not models:
+        raise ValueError("a crowd needs at least one model")
+    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=models[0].wearer)) for model in models)
+    for number, (leaves, structure) in enumerate(others, 1):
+        same = structure == first[1] and all(
+            a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0], strict=True)
+        )
+        if not same:
+            raise ValueError(
+                f"models[{number}] differs from models[0] in more than its wearer: a crowd is of one garment, and of "
+                "models whose blend shapes `specialise` has not fitted to their characters"
+            )
+    wearers = jax.tree.map(lambda *each: jnp.stack(each), *(model.wearer for model in models))
+    return dataclasses.replace(models[0], wearer=wearers)
+
+
+def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
+    """Load the model of a finished run, or of a garment that comes with the library.
+
+    Args:
+        run: the folder of a run or of a packed model, or a name from `trained.shipped()`, such as "skirt".
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
+    """
+    run_psi = trained.psi(trained.find(run))
+    body, names = storage.load_rig(run_psi.config.body)
+    return build(
+        run_psi.config,
+        storage.load_garment(run_psi.config.garment, body),
+        body,
+        names,
+        run_psi.garment,
+        run_psi.predictor,
+        run_psi.normalizers,
+        betas=betas,
+        material=material,
+    )
