@@ -23,6 +23,7 @@ from clothjax.evaluation.rollouts import (
 from clothjax.files import storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
+from clothjax.networks.normalisation import ForceScales
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
 from clothjax.runtime import models, trained
@@ -134,12 +135,23 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         compiled = play.lower(model, character, poses).compile()
         return lambda: np.asarray(compiled(model, character, poses))
 
+    if config.stage2.forces and not baseline:
+        student = trained.psi(run)
+        assert isinstance(student.normalizers, ForceScales)
+        feeling = animators.force_psi_animator(student.garment, student.normalizers)
+        roll = jax.jit(lambda m, c, p: rollouts.states(feeling, m, experiment, c, p))
+
+    def force_psi(character: Character, clip: Motion):
+        return lambda: np.asarray(roll({"params": student.predictor}, character, windows(clip)))
+
     def psi(character: Character, clip: Motion):
         loaded = models.load(run, betas=np.asarray(character.betas), material=character.material)
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)
 
-    return {"lbs": skinned} | ({baseline: network} if baseline else {"phi": network, "psi": psi})
+    return {"lbs": skinned} | (
+        {baseline: network} if baseline else {"phi": network, "psi": force_psi if config.stage2.forces else psi}
+    )
 
 
 def simulate(

@@ -1,13 +1,13 @@
-"""Forces on the cloth in the space of codes (METHOD.md, Psi with forces): what a Psi with forces reads of the physics."""
+"""Forces on the cloth in the space of codes, which a Psi with forces reads (METHOD.md, Psi with forces)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import PhysicsConfig
+from clothjax.networks.normalisation import Whitening
 from clothjax.physics import incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.types import Array, Mesh
@@ -21,13 +21,6 @@ KINDS = {
 SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its largest
 
 
-class Whitening(NamedTuple):
-    """Maps between codes and whitened codes, in which the mean Hessian of the potential is the identity."""
-
-    to: Array  # [L, L] H^(1/2), symmetric: whitened = to @ code
-    back: Array  # [L, L] H^(-1/2), symmetric: code = back @ whitened
-
-
 def whitening(inverse_hessian: Array) -> Whitening:
     """Return the whitening of an inverse mean Hessian [L, L] in 1/J."""
     values, vectors = np.linalg.eigh(np.asarray(inverse_hessian, np.float64))
@@ -38,9 +31,7 @@ def whitening(inverse_hessian: Array) -> Whitening:
     )
 
 
-def reduced(
-    garment: Callable[[Array], Array], code: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig
-) -> Array:
+def reduced(garment: Callable[[Array], Array], code: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
     """Return the forces [3, L] in J on a code [L]: for each of `KINDS`, minus the gradient of its energies.
 
     Args:
