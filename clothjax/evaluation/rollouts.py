@@ -91,15 +91,15 @@ def phi_trajectory(experiment: Experiment, phi: dict, character: Character, pose
 
 
 def psi_trajectory(psi: Model, clip: Motion) -> np.ndarray:
-    """Roll Psi out on a clip of T frames: return the garment [T - 2, V, 3] m at the same frames as `windows` has.
+    """Roll Psi out on a clip: [T - 2, V, 3] m at the same frames, relative to the root."""
+    return relative(lambda motion: inference.animate(psi, motion)[0], clip)
 
-    It is relative to the root, as the other trajectories are.
-    """
+
+def relative(animate: Callable[[Motion], Array], clip: Motion) -> np.ndarray:
+    """Return the trajectory of `psi_trajectory`, of a function from a motion to vertices [T, V, 3] m in the world."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
-    origin = part.translation[:1]
-    local = part._replace(translation=(part.translation - origin).astype(np.float32), rotations=part.rotations)
-    vertices, _ = inference.animate(psi, local)
-    return np.asarray(vertices) - np.asarray(local.translation)[:, None]
+    local = part._replace(translation=(part.translation - part.translation[:1]).astype(np.float32))
+    return np.asarray(animate(local)) - local.translation[:, None]
 
 
 def load_run(
