@@ -91,7 +91,10 @@ def phi_trajectory(experiment: Experiment, phi: dict, character: Character, pose
 
 
 def psi_trajectory(psi: Model, clip: Motion) -> np.ndarray:
-    """Roll Psi out on a clip: [T - 2, V, 3] m at the same frames, relative to the root."""
+    """Roll Psi out on a clip of T frames: return the garment [T - 2, V, 3] m at the same frames as `windows` has.
+
+    It is relative to the root, as the other trajectories are.
+    """
     return relative(lambda motion: inference.animate(psi, motion)[0], clip)
 
 

@@ -212,7 +212,7 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
     config = configuration.load(Config, directory / CONFIG)
     path = directory / WEIGHTS
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged one open
             damage.refuse_newer(path, int(file["format"]) if "format" in file.files else 1, FORMAT)
             names = [name for name in file.files if name != "format" and not name.endswith("|scale")]
             leaves = {name: file[name] for name in names}
