@@ -42,12 +42,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def model_argument(parser: Parser, nargs: str | None = None, default: Any = None, about: str = "") -> None:
-    """Add the positional argument `model` to a parser: the text that `model_folder` takes.
-
-    Args:
-        nargs, default: as of `ArgumentParser.add_argument`.
-        about: text that is added to the help.
-    """
+    """Add the positional argument `model`, as text for `trained.find`."""
     parser.takes_model = True
     parser.add_argument(
         "model",
@@ -56,17 +51,6 @@ def model_argument(parser: Parser, nargs: str | None = None, default: Any = None
         default=default,
         help="a run's folder, a packed folder, or the name of a garment that comes with clothjax" + about,
     )
-
-
-def model_folder(text: str | Path) -> Path:
-    """Return the folder of a model: a run, a packed model, or a garment that comes with clothjax by its name.
-
-    Raises:
-        ValueError: if there is no such folder and no such garment.
-    """
-    from clothjax.runtime import trained
-
-    return trained.find(text)
 
 
 def refuse_old_spellings(

@@ -120,7 +120,7 @@ def _garments() -> tuple[list[str], bool]:
     lines, sound = [], True
     for name in trained.shipped():
         try:
-            trained.psi(trained.folder(name))
+            trained.psi(trained.find(name))
             lines.append(f"  {name:20} ready")
         except ValueError as error:
             lines.append(f"  {name:20} {error}")

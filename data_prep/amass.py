@@ -31,7 +31,7 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
         ValueError: naming the file, the array and the first wrong entry.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             missing = [key for key in ("poses", "trans") if key not in file.files]
             rate = next((key for key in RATES if key in file.files), None)
             if missing or rate is None:

@@ -145,15 +145,9 @@ def _check_place(path: str | Path, vertices: np.ndarray, surface: Surface, answe
 
 
 def _clean(path: str | Path, points: np.ndarray, faces: np.ndarray) -> tuple[Working, np.ndarray]:
-    """Weld vertices at one place, and remove faces without area and vertices without a face.
+    """Weld vertices [V, 3] m at one place, and remove faces without area and vertices without a face.
 
-    Args:
-        path: of the file, for messages.
-        points: [V, 3] m, the file's vertices.
-        faces: [F, 3].
-
-    Returns:
-        The garment, nothing pinned, and for each of the file's vertices [V] its index in it, -1 for none.
+    Return the garment, nothing pinned, and for each of the file's vertices [V] its index in it, -1 for none.
     """
     near = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
     _, first, welded = np.unique(components(len(points), near), return_index=True, return_inverse=True)
@@ -203,15 +197,7 @@ def _marked(path: str | Path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
 
 
 def _pin_marked(path: str | Path, working: Working, mesh: Mesh, index: np.ndarray, pin: str) -> Working:
-    """Pin the vertices that the file marks; none for `none` and `highest`.
-
-    Args:
-        path: of the file, for messages.
-        working: garment.
-        mesh: of the file.
-        index: for each of the file's vertices its index in the garment, -1 for none.
-        pin: the user's answer.
-    """
+    """Pin the vertices that the file marks; none for `none` and `highest`. `index` is that of `_clean`."""
     if pin in ("none", "highest"):
         return working
     marked = index[_marked(path, mesh, pin, "--pin")]
@@ -221,15 +207,7 @@ def _pin_marked(path: str | Path, working: Working, mesh: Mesh, index: np.ndarra
 def _assign_cloth(
     path: str | Path, working: Working, mesh: Mesh, index: np.ndarray, regions: tuple[str, ...]
 ) -> Working:
-    """Set the cloth's factors in the regions that the user names; a later region covers an earlier one.
-
-    Args:
-        path: of the file, for messages.
-        working: garment.
-        mesh: of the file.
-        index: for each of the file's vertices its index in the garment, -1 for none.
-        regions: each WHAT=DENSITY,STRETCHING,BENDING.
-    """
+    """Set the cloth's factors in regions WHAT=DENSITY,STRETCHING,BENDING; a later one covers an earlier one."""
     if not regions:
         return working
     factors, (low, high) = np.ones((len(working.vertices), 3)), FACTORS

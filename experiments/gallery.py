@@ -12,6 +12,7 @@ from pathlib import Path
 from clothjax import cli
 from clothjax.evaluation.pictures import GALLERY_MOTIONS, gallery
 from clothjax.render import ray_cast
+from clothjax.runtime import trained
 
 
 def main(argv: list[str]) -> None:
@@ -21,7 +22,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--frame", type=int, default=40, help="the frame shown")
     parser.add_argument("--out", type=Path, required=True, help="a .png")
     arguments = parser.parse_args(argv)
-    run = cli.model_folder(arguments.model)
+    run = trained.find(arguments.model)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     rows, columns = gallery(run, arguments.motions, arguments.frame)
     ray_cast.comparison(arguments.out, rows, columns)

@@ -41,7 +41,7 @@ def main(argv: list[str]) -> None:
         help="skipped steps in a row to put up with; default: as training",
     )
     arguments = parser.parse_args(argv)
-    run = cli.model_folder(arguments.model)
+    run = trained.find(arguments.model)
     begun = [stage for stage in PHYSICS if checkpoint.steps(run / stage / "checkpoints")]
     if not begun or (arguments.stage and arguments.stage not in begun):
         raise ValueError(f"{run}: has no checkpoint of {arguments.stage or ' or '.join(PHYSICS)} to start from")

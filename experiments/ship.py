@@ -21,7 +21,7 @@ def main(argv: list[str]) -> None:
     cli.model_argument(parser, about="; such as experiments.tune left")
     parser.add_argument("name", help="of the garment")
     arguments = parser.parse_args(argv)
-    run, folder = cli.model_folder(arguments.model), trained.MODELS / arguments.name
+    run, folder = trained.find(arguments.model), trained.MODELS / arguments.name
     if trained.packed(run):
         packed, about = run, trained.provenance(run)
     else:

@@ -28,7 +28,7 @@ def main(argv: list[str]) -> None:
     cli.model_argument(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder to leave it in")
     arguments, settings = parser.parse_known_args(argv)
-    folder = cli.model_folder(arguments.model)
+    folder = trained.find(arguments.model)
     if not trained.packed(folder):
         raise ValueError(f"{folder}: not a packed model; train a run further with `python -m clothjax train`")
     config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(arguments.out)])

@@ -53,7 +53,7 @@ def main(argv: list[str]) -> None:
     arguments = parser.parse_args(argv)
     options = Options(**{name: getattr(arguments, name) for name in Options._fields})
     formats.check(arguments.to, options)
-    run = cli.model_folder(arguments.model)
+    run = trained.find(arguments.model)
     betas = None
     if arguments.betas is not None:
         count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]

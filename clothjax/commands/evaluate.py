@@ -59,7 +59,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--json", type=Path, default=None, help="default: evaluation.json, in the folder of one run")
     arguments = parser.parse_args(argv)
     names = trained.shipped() if arguments.model == ["all"] else arguments.model
-    folders = {Path(name).resolve().name: cli.model_folder(name) for name in names}
+    folders = {Path(name).resolve().name: trained.find(name) for name in names}
     if len(folders) < len(names):
         raise ValueError(f"two models have one name: {', '.join(names)}; measure them one after the other")
     first = next(iter(folders.values()), Path("."))

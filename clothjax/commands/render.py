@@ -16,6 +16,7 @@ from pathlib import Path
 from clothjax import cli
 from clothjax.evaluation.pictures import WRITERS, perform, write_comparison
 from clothjax.evaluation.rollouts import load_run
+from clothjax.runtime import trained
 
 
 def main(argv: list[str]) -> None:
@@ -35,7 +36,7 @@ def main(argv: list[str]) -> None:
     kind = arguments.out.suffix
     if kind != ".png" and kind not in WRITERS:
         raise ValueError(f"{arguments.out}: cannot write {kind!r}; allowed: .png, {', '.join(WRITERS)}")
-    run = cli.model_folder(arguments.model)
+    run = trained.find(arguments.model)
     experiment, _ = load_run(run)
     motions = arguments.motions or experiment.config.evaluation.motions[:1]
     frames = arguments.frames or experiment.config.evaluation.animation_frames

@@ -116,11 +116,7 @@ Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
 
 
 def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
-    """Return the methods to measure, by name.
-
-    Args:
-        model: of `load_run`.
-    """
+    """Return the stages to measure, by name, of what `load_run` gave."""
     config = experiment.config
     baseline = config.peer.network
     joints = input_joints(experiment.names, config.stage2)

@@ -95,11 +95,14 @@ def psi_trajectory(psi: Model, clip: Motion) -> np.ndarray:
 
     It is relative to the root, as the other trajectories are.
     """
+    return relative(lambda motion: inference.animate(psi, motion)[0], clip)
+
+
+def relative(animate: Callable[[Motion], Array], clip: Motion) -> np.ndarray:
+    """Return the trajectory of `psi_trajectory`, of a function from a motion to vertices [T, V, 3] m in the world."""
     part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
-    origin = part.translation[:1]
-    local = part._replace(translation=(part.translation - origin).astype(np.float32), rotations=part.rotations)
-    vertices, _ = inference.animate(psi, local)
-    return np.asarray(vertices) - np.asarray(local.translation)[:, None]
+    local = part._replace(translation=(part.translation - part.translation[:1]).astype(np.float32))
+    return np.asarray(animate(local)) - local.translation[:, None]
 
 
 def load_run(

@@ -131,15 +131,14 @@ def read(directory: str | Path, *parts: str) -> tuple[dict[str, Any], Checkpoint
 
     def read_one(path: Path) -> tuple[dict[str, Any], Checkpoint]:
         about = _about(path)
-        like: dict = {part: {} for part in parts}
-        for name, leaf in about.leaves.items():
-            *above, last = name.split("/")
-            if above and above[0] in parts:
-                node = like
-                for key in above:
-                    node = node.setdefault(key, {})
-                node[last] = jax.ShapeDtypeStruct(tuple(leaf["shape"]), leaf["dtype"])
-        empty = [part for part in parts if not like[part]]
+        like = nested(
+            {
+                name: jax.ShapeDtypeStruct(tuple(leaf["shape"]), leaf["dtype"])
+                for name, leaf in about.leaves.items()
+                if name.partition("/")[0] in parts and "/" in name
+            }
+        )
+        empty = [part for part in parts if part not in like]
         if empty:
             raise ValueError(f"{path}: has no {', '.join(empty)}; it is of another kind of training")
         leaves = _leaves(about, named(like))
@@ -167,6 +166,18 @@ def named(tree: Any) -> dict[str, Any]:
     by_name = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
     assert len(by_name) == len(leaves), "two leaves of the state have the same path"
     return by_name
+
+
+def nested(leaves: dict[str, Any]) -> dict[str, Any]:
+    """Return leaves by path as nested dictionaries: the inverse of `named`."""
+    tree: dict[str, Any] = {}
+    for name, leaf in leaves.items():
+        *above, last = name.split("/")
+        node = tree
+        for key in above:
+            node = node.setdefault(key, {})
+        node[last] = leaf
+    return tree
 
 
 def _is_key(leaf: Any) -> bool:

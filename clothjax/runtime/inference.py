@@ -7,7 +7,9 @@ needed none of this.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +22,7 @@ from clothjax.runtime.models import Layer, Model, Network, State, Wearer
 from clothjax.types import Array, Motion, Pose
 
 FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
+T = TypeVar("T")
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -159,11 +162,16 @@ def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
 
 @jax.jit
 def _animate(model: Model, motion: Motion) -> tuple[Array, Array]:
+    return rollout(model, motion, lambda state, vertices: (vertices, state.ok))
+
+
+def rollout(model: Model, motion: Motion, kept: Callable[[State, Array | None], T], vertices: bool = True) -> T:
+    """Take a step for every frame of a motion, and return what `kept` keeps of each, stacked; for use within jit."""
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
     first = jax.tree.map(lambda x: x[0], poses)
 
     def frame(state, pose):
-        state, vertices = step(model, state, pose)
-        return state, (vertices, state.ok)
+        state, shown = step(model, state, pose, vertices)
+        return state, kept(state, shown)
 
     return jax.lax.scan(frame, initial_state(model, first), poses)[1]

@@ -12,9 +12,9 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.files import storage
 from clothjax.geometry import proximity
-from clothjax.runtime.inference import blend_weights, initial_state, step
+from clothjax.runtime.inference import blend_weights, rollout
 from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model, Network
-from clothjax.types import Array, Garment, Motion, Pose
+from clothjax.types import Array, Garment, Motion
 
 FOLD_RATIO = 0.75  # folding must leave at most this part of the weights of the layers around the code
 CALIBRATION_CLIPS = ("walk_0", "run_0", "jump_0", "twist_0", "dance_0", "arms_0")  # give the usual displacements
@@ -216,13 +216,7 @@ def ordinary_weights(model: Model) -> np.ndarray:
 @jax.jit
 def _codes(model: Model, motion: Motion) -> Array:
     """Return the codes [T, C] of an autoregressive rollout."""
-    poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
-
-    def frame(state, pose):
-        state, _ = step(model, state, pose, vertices=False)
-        return state, state.latent
-
-    return jax.lax.scan(frame, initial_state(model, jax.tree.map(lambda x: x[0], poses)), poses)[1]
+    return rollout(model, motion, lambda state, _: state.latent, vertices=False)
 
 
 def _product(a: Array, b: Array) -> Array:

@@ -58,17 +58,6 @@ def find(model: str | Path) -> Path:
     )
 
 
-def folder(name: str) -> Path:
-    """Return the folder of a garment that comes with the library.
-
-    Raises:
-        ValueError: if there is no garment of that name.
-    """
-    if name not in shipped():
-        raise ValueError(f"no garment called {name!r} comes with clothjax; there are: {', '.join(shipped()) or 'none'}")
-    return MODELS / name
-
-
 def phi(run: str | Path) -> tuple[Config, dict]:
     """Load the configuration and the `params` and `statistics` of Phi, from a run or a packed model.
 
@@ -229,20 +218,15 @@ def _config(run: Path) -> Config:
 def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
     config = configuration.load(Config, directory / CONFIG)
     path = directory / WEIGHTS
-    tree: dict = {}
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged one open
             damage.refuse_newer(path, int(file["format"]) if "format" in file.files else 1, FORMAT)
             names = [name for name in file.files if name != "format" and not name.endswith("|scale")]
-            for name in names:
-                leaf = file[name]
-                if leaf.dtype == np.int8:
-                    leaf = leaf * file[f"{name}|scale"]
-                *above, last = name.split("/")
-                node = tree
-                for key in above:
-                    node = node.setdefault(key, {})
-                node[last] = leaf.astype(np.float32)
+            leaves = {name: file[name] for name in names}
+            for name, leaf in leaves.items():
+                scale = file[f"{name}|scale"] if leaf.dtype == np.int8 else 1
+                leaves[name] = (leaf * scale).astype(np.float32)
+        tree = checkpoint.nested(leaves)
         tree["phi"]["garment"]  # all else of a model needs it
         return config, {
             "phi": tree["phi"],

@@ -139,7 +139,7 @@ def measure(part: str, names: list[str], quick: bool) -> dict:
             measured = inference.measure(**(QUICK_INFERENCE if quick else INFERENCE))
         else:
             names = names or (QUICK_GARMENTS if quick else trained.shipped())
-            measured = pareto.measure([cli.model_folder(name) for name in names], **(QUICK_PARETO if quick else PARETO))
+            measured = pareto.measure([trained.find(name) for name in names], **(QUICK_PARETO if quick else PARETO))
     return {"machine": machine(), part: measured | {"peaks": timing.peaks(3), "noise": timing.noise()}}
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from clothjax import material
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.evaluation import rollouts
-from clothjax.evaluation.rollouts import load_run, skinned_trajectory, windows
+from clothjax.evaluation.rollouts import load_run, relative, skinned_trajectory, windows
 from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.files import storage
@@ -134,23 +133,16 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
     for name, form in forms.items():
         for int8 in (False, True):
             path = onnx.to_onnx(form, folder / f"{len(variants)}.onnx", int8=int8)
-            tracks = [_local(lambda m, p=path, f=form: onnx.run_onnx(p, f, m), clip) for clip in case.clips]
+            tracks = [relative(lambda m, p=path, f=form: onnx.run_onnx(p, f, m), clip) for clip in case.clips]
             label = f"{name}, int8" if int8 else name
             spared = given_features(form, folder / "spared.onnx", int8=int8)
             variants[label] = Variant(family, "onnx", tracks, session_call(spared))
             variants[f"{label}, from the pose"] = Variant(family, "onnx", tracks, onnx_call(path, form))
         if library:
             path = native.to_c(form, folder / f"{len(variants)}.psi")
-            tracks = [_local(lambda m, p=path: native.run_c(library, p, m), clip) for clip in case.clips]
+            tracks = [relative(lambda m, p=path: native.run_c(library, p, m), clip) for clip in case.clips]
             variants[f"{name}, C"] = Variant(family, "c", tracks, c_call(library, path, form))
     return variants
-
-
-def _local(run: Callable[[Motion], np.ndarray], clip: Motion) -> np.ndarray:
-    """Return trajectories like `psi_trajectory`, from a function that gives vertices [T, V, 3] m of a motion."""
-    part = Motion(clip.rotations[1:-1], np.asarray(clip.translation[1:-1]), clip.fps)
-    local = part._replace(translation=(part.translation - part.translation[:1]).astype(np.float32))
-    return run(local) - local.translation[:, None]
 
 
 def _phi(case: Case, run: Path, descent_steps: tuple[int, ...]) -> dict[str, Variant]:

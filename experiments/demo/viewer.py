@@ -246,9 +246,9 @@ def start(arguments: argparse.Namespace) -> Viewer:
     print(f"open {address} in a browser; stop with Ctrl-C", flush=True)
     if not arguments.no_browser:
         webbrowser.open(address)
-    garments, garment = {name: trained.folder(name) for name in trained.shipped()}, arguments.model
+    garments, garment = {name: trained.find(name) for name in trained.shipped()}, arguments.model
     if garment not in garments:  # a folder stands alone: its body may be another
-        folder = cli.model_folder(garment)
+        folder = trained.find(garment)
         garments, garment = {folder.name: folder}, folder.name
     config = trained.psi(garments[garment]).config
     body, names = storage.load_rig(config.body)

@@ -27,6 +27,7 @@ import numpy as np
 from clothjax import cli
 from clothjax.config import Config
 from clothjax.progress import progress_bar
+from clothjax.runtime import trained
 from experiments.stability import physics, rollouts, solver
 
 matplotlib.use("Agg")
@@ -40,7 +41,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--json", type=Path, default=Path("stability.json"))
     parser.add_argument("--quick", action="store_true", help="a tenth of it")
     arguments = parser.parse_args(argv)
-    report, curves = stress(arguments.model and cli.model_folder(arguments.model), arguments.quick)
+    report, curves = stress(arguments.model and trained.find(arguments.model), arguments.quick)
     arguments.json.parent.mkdir(parents=True, exist_ok=True)
     arguments.json.write_text(json.dumps(report, indent=1) + "\n")
     picture = arguments.json.with_suffix(".png")

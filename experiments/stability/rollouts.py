@@ -49,19 +49,14 @@ class Shock(NamedTuple):
 
 def play(model: Model, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices [T, V, 3] m relative to the root, codes [T, L] in standard deviations, and `ok` [T]."""
-    vertices, latents, ok = _play(model, jax.tree.map(jnp.asarray, Pose(*map(np.float32, motion[:2]))))
+    vertices, latents, ok = _play(model, motion)
     root = np.nan_to_num(np.asarray(motion.translation, np.float32))
     return np.asarray(vertices) - root[:, None], np.asarray(latents), np.asarray(ok)
 
 
 @jax.jit
-def _play(model: Model, poses: Pose):
-    def frame(state, pose):
-        state, vertices = inference.step(model, state, pose)
-        return state, (vertices, state.latent, state.ok)
-
-    first = jax.tree.map(lambda x: x[0], poses)
-    return jax.lax.scan(frame, inference.initial_state(model, first), poses)[1]
+def _play(model: Model, motion: Motion):
+    return inference.rollout(model, motion, lambda state, vertices: (vertices, state.latent, state.ok))
 
 
 def measure(experiment: Experiment, character: Character, played: tuple) -> Loop:

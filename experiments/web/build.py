@@ -41,7 +41,7 @@ def main(argv: list[str]) -> None:
     for folder in ("garments", "motions"):
         (arguments.out / folder).mkdir(parents=True, exist_ok=True)
     names = arguments.model or trained.shipped()
-    garments = {Path(name).resolve().name: models.load(cli.model_folder(name)) for name in names}
+    garments = {Path(name).resolve().name: models.load(trained.find(name)) for name in names}
     if len(garments) < len(names):
         raise ValueError(f"two models have one name: {', '.join(names)}; rename one")
     first, *others = garments.values()

@@ -31,7 +31,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 FAMILIES = ("walk", "run", "arms")
-SKIRT, TSHIRT, DRESS = (trained.folder(name) for name in ("skirt", "tshirt", "dress"))
+SKIRT, TSHIRT, DRESS = (trained.find(name) for name in ("skirt", "tshirt", "dress"))
 
 
 @pytest.fixture(scope="module")

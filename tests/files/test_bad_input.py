@@ -466,7 +466,7 @@ def a_recording_that_is_not_there(folder):
 
 def packed(folder: Path, change) -> Path:
     """A garment of the library with something changed in its weights."""
-    shutil.copytree(trained.folder("skirt"), folder / "skirt")
+    shutil.copytree(trained.find("skirt"), folder / "skirt")
     change(folder / "skirt" / trained.WEIGHTS)
     return folder / "skirt"
 

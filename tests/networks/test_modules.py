@@ -110,13 +110,13 @@ def test_a_block_alone_is_a_module(toy):
 
 @pytest.mark.parametrize("name", trained.shipped())
 def test_shipped_garments_have_the_names_and_shapes_of_the_modules(name):
-    config, model = trained.phi(trained.folder(name))
+    config, model = trained.phi(trained.find(name))
     experiment = assembly.assemble(dataclasses.replace(config, motions=("walk_0",)))
     ours = jax.eval_shape(Phi(config.model, experiment.scene).init, jax.random.key(0), features(experiment))
     theirs = checkpoint.named(model)
     assert list(checkpoint.named(ours)) == list(theirs)
     assert {n: x.shape for n, x in checkpoint.named(ours).items()} == {n: x.shape for n, x in theirs.items()}
-    _, garment, predictor, normalizers = trained.psi(trained.folder(name))
+    _, garment, predictor, normalizers = trained.psi(trained.find(name))
     code, pose = (len(part.mean) for part in normalizers)
     rows = len(predictor["dense_0"]["kernel"]) - code - pose
     psi = jax.eval_shape(Psi(config.stage2).init, jax.random.key(0), *(jnp.zeros(n) for n in (code, pose, rows)))
@@ -139,7 +139,7 @@ def test_baselines_are_modules_too(network):
 
 
 def test_a_packed_model_of_a_newer_format_is_refused(tmp_path, monkeypatch):
-    shutil.copytree(trained.folder("skirt"), tmp_path / "skirt")
+    shutil.copytree(trained.find("skirt"), tmp_path / "skirt")
     config, model = trained.phi(tmp_path / "skirt")  # the first format, which has no number
     _, _, predictor, normalizers = trained.psi(tmp_path / "skirt")
     trained.write(tmp_path / "again", config, model, predictor, normalizers)

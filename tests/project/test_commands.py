@@ -148,12 +148,12 @@ def test_a_model_is_a_run_a_packed_folder_or_a_name(tmp_path, monkeypatch):
     (tmp_path / "packed" / trained.WEIGHTS).write_bytes(b"")
     (tmp_path / "skirt").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert cli.model_folder("runs/mine") == tmp_path.__class__("runs/mine")
-    assert trained.packed(cli.model_folder(str(tmp_path / "packed")))
-    assert cli.model_folder("skirt") == trained.MODELS / "skirt"
-    assert cli.model_folder("./skirt").resolve() == tmp_path / "skirt"
+    assert trained.find("runs/mine") == tmp_path.__class__("runs/mine")
+    assert trained.packed(trained.find(str(tmp_path / "packed")))
+    assert trained.find("skirt") == trained.MODELS / "skirt"
+    assert trained.find("./skirt").resolve() == tmp_path / "skirt"
     with pytest.raises(ValueError, match=r"coat: no such folder.* a run's folder, a packed folder or a name: .*skirt"):
-        cli.model_folder("coat")
+        trained.find("coat")
 
 
 def test_training_needs_a_file_or_a_garment(monkeypatch):
