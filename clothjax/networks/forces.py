@@ -22,12 +22,12 @@ SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its large
 
 
 def whitening(inverse_hessian: Array) -> Whitening:
-    """Return the whitening of an inverse mean Hessian [L, L] in 1/J."""
+    """Return the whitening of an inverse mean Hessian [L, L] in 1/J, on the host."""
     values, vectors = np.linalg.eigh(np.asarray(inverse_hessian, np.float64))
     sizes = np.sqrt(np.maximum(values, SMALLEST * values[-1]))
     return Whitening(
-        to=jnp.asarray((vectors / sizes) @ vectors.T, jnp.float32),
-        back=jnp.asarray((vectors * sizes) @ vectors.T, jnp.float32),
+        to=np.asarray((vectors / sizes) @ vectors.T, np.float32),
+        back=np.asarray((vectors * sizes) @ vectors.T, np.float32),
     )
 
 

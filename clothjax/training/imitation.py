@@ -47,7 +47,9 @@ def blank(garment: dict, whitening: Whitening, constants: int, config: Config) -
     params = mlp.init(ForcePsi(config.stage2, latent), model_key, jnp.zeros(size))
     params = params | {"linear": jax.tree.map(jnp.zeros_like, params["linear"])}
     scale, far = normalisation.identity(size), jnp.full(latent, 1e6)
-    scales = ForceScales(jax.tree.map(jnp.asarray, scale), jnp.float32(0.0), whitening, -far, far)
+    scales = ForceScales(
+        jax.tree.map(jnp.asarray, scale), jnp.float32(0.0), jax.tree.map(jnp.array, whitening), -far, jnp.array(far)
+    )
     average = jax.tree.map(jnp.array, params)
     garment = jax.tree.map(jnp.array, garment)
     return TrainingState(jnp.int32(0), key, params, average, optimizer(config).init(params), scales, garment)
