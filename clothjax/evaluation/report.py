@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import cache
 from itertools import count
 from pathlib import Path
 
@@ -23,7 +24,6 @@ from clothjax.evaluation.rollouts import (
 from clothjax.files import storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
-from clothjax.networks.normalisation import ForceScales
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
 from clothjax.runtime import models, trained
@@ -131,23 +131,22 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         compiled = play.lower(model, character, poses).compile()
         return lambda: np.asarray(compiled(model, character, poses))
 
-    if config.stage2.forces and not baseline:
+    @cache
+    def with_forces() -> Callable:
         student = trained.psi(run)
-        assert isinstance(student.normalizers, ForceScales)
-        feeling = animators.force_psi_animator(student.garment, student.normalizers)
-        roll = jax.jit(lambda m, c, p: rollouts.states(feeling, m, experiment, c, p))
-
-    def force_psi(character: Character, clip: Motion):
-        return lambda: np.asarray(roll({"params": student.predictor}, character, windows(clip)))
+        make = animators.force_psi_animator(student.garment, student.normalizers)
+        params = {"params": student.predictor}
+        play = jax.jit(lambda c, p: rollouts.states(make, params, experiment, c, p))
+        return lambda character, poses: np.asarray(play(character, poses))
 
     def psi(character: Character, clip: Motion):
+        if config.stage2.forces:
+            return lambda: with_forces()(character, windows(clip))
         loaded = models.load(run, betas=np.asarray(character.betas), material=character.material)
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)
 
-    return {"lbs": skinned} | (
-        {baseline: network} if baseline else {"phi": network, "psi": force_psi if config.stage2.forces else psi}
-    )
+    return {"lbs": skinned} | ({baseline: network} if baseline else {"phi": network, "psi": psi})
 
 
 def simulate(

@@ -142,16 +142,16 @@ def pack(run: str | Path, out: str | Path) -> int:
     """
     config, model = phi(run)
     student = psi(run)
+    if isinstance(student.normalizers, ForceScales):
+        raise ValueError(
+            f"{run}: a Psi with forces (stage2.forces) cannot be packed yet; `clothjax evaluate` measures it"
+        )
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
         if done != wanted:
             raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
     decoder = checkpoint.named(model["params"]["garment"])
-    if isinstance(student.normalizers, ForceScales):
-        raise ValueError(
-            f"{run}: a Psi with forces (stage2.forces) cannot be packed yet; `clothjax evaluate` measures it"
-        )
     if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(student.garment).items()):
         raise ValueError(
             f"{run}: stage 1 was trained further after stage 2: remove its {', '.join(STAGES[1:])}, and train again"

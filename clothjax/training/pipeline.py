@@ -179,6 +179,9 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     """Run stage 2 of a Psi with forces: rounds of labels and of training on all labels so far.
 
     Also return the seconds of labelling. A round's labels stay in the run's folder; a run that is resumed reads them.
+
+    Raises:
+        ValueError: if fine-tuning has begun on another stage 2, or no frame could be labelled.
     """
     experiment, config = run.experiment, run.config
     scene, settings, folder = experiment.scene, config.labels, run.directory / "stage2"
@@ -191,6 +194,8 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     files = [folder / f"labels_{number:02}.npz" for number in range(settings.rounds)]
     progress.say(f"stage 2: the latent predictor with forces, {settings.rounds} rounds of {settings.steps} steps")
     description = f"stage 2, {config.garment}"
+    if run.steps("tuning") and done < settings.rounds * settings.steps:
+        raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
     fitted, clock = None, {}
     if done and done % settings.steps == 0:
         fitted = _fit(run, "stage2", lambda state: (state, {}), state, done, description)  # read, not trained
@@ -225,12 +230,7 @@ def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
     """
     experiment, config = run.experiment, run.config
     progress.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    if isinstance(psi.normalizers, ForceScales):
-        animator = animators.force_psi_animator(psi.garment, psi.normalizers)
-    else:
-        joints = input_joints(experiment.names, config.stage2)
-        gradients = fine_tuning.preconditioners(experiment, run.clips, phi, psi.normalizers, joints)
-        animator = animators.psi_animator(psi.garment, psi.normalizers, joints, gradients)
+    animator = fine_tuning.animator(experiment, run.clips, phi, psi.garment, psi.normalizers)
     settings = fine_tuning.settings(config)
     update = stage1.make_curriculum(experiment.scene, run.clips, settings, STEPS_PER_CALL, run.device_mesh, animator)
     state = fine_tuning.init(psi.predictor, experiment.scene, run.clips, config)
