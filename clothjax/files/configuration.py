@@ -131,10 +131,10 @@ class _Reader:
         merged = dict(old)
         for key, value in new.items():
             path, inherited = _join(prefix, key), merged.get(key)
-            shared = isinstance(value, dict) and isinstance(inherited, dict)
-            self.sources[path] = (*(self.sources.get(path, ()) if shared else ()), source)
+            under = inherited if isinstance(value, dict) and isinstance(inherited, dict) else None
+            self.sources[path] = (*(() if under is None else self.sources.get(path, ())), source)
             if isinstance(value, dict):
-                value = self.merge(inherited if shared else {}, value, path, source)
+                value = self.merge(under or {}, value, path, source)
             merged[key] = value
         return merged
 

@@ -9,7 +9,7 @@ needed none of this.
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -165,7 +165,7 @@ def _animate(model: Model, motion: Motion) -> tuple[Array, Array]:
     return rollout(model, motion, lambda state, vertices: (vertices, state.ok))
 
 
-def rollout(model: Model, motion: Motion, kept: Callable[[State, Array | None], T], vertices: bool = True) -> T:
+def rollout(model: Model, motion: Motion, kept: Callable[[State, Any], T], vertices: bool = True) -> T:
     """Take a step for every frame of a motion, and return what `kept` keeps of each, stacked; for use within jit."""
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
     first = jax.tree.map(lambda x: x[0], poses)
