@@ -24,6 +24,7 @@ from clothjax.evaluation.rollouts import (
 from clothjax.files import storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
+from clothjax.networks.normalisation import ForceScales
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
 from clothjax.runtime import models, trained
@@ -134,6 +135,7 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
     @cache
     def with_forces() -> Callable:
         student = trained.psi(run)
+        assert isinstance(student.normalizers, ForceScales)
         make = animators.force_psi_animator(student.garment, student.normalizers)
         params = {"params": student.predictor}
         play = jax.jit(lambda c, p: rollouts.states(make, params, experiment, c, p))

@@ -93,7 +93,7 @@ def examples(labels: Labels, scales: ForceScales) -> tuple[np.ndarray, np.ndarra
     """Return scaled inputs [n, N] and targets [n, L] of the labels."""
     inputs = (_inputs(labels, scales.whitening) - np.asarray(scales.inputs.mean)) / np.asarray(scales.inputs.deviation)
     targets = (labels.target - labels.code) @ np.asarray(scales.whitening.to) / float(scales.output)
-    return inputs.astype(np.float32), targets.astype(np.float32)
+    return np.asarray(inputs, np.float32), np.asarray(targets, np.float32)
 
 
 def _inputs(labels: Labels, whitening: Whitening) -> np.ndarray:
