@@ -254,7 +254,7 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
     """
     run_psi = trained.psi(trained.find(run))
     if isinstance(run_psi.normalizers, ForceScales):
-        raise ValueError(f"{run}: a Psi with forces (stage2.forces) does not run yet; `clothjax evaluate` measures it")
+        raise ValueError(f"{run}: a Psi with forces does not run outside training yet; `clothjax evaluate` measures it")
     body, names = storage.load_rig(run_psi.config.body)
     return build(
         run_psi.config,

@@ -143,9 +143,7 @@ def pack(run: str | Path, out: str | Path) -> int:
     config, model = phi(run)
     student = psi(run)
     if isinstance(student.normalizers, ForceScales):
-        raise ValueError(
-            f"{run}: a Psi with forces (stage2.forces) cannot be packed yet; `clothjax evaluate` measures it"
-        )
+        raise ValueError(f"{run}: a Psi with forces cannot be packed yet; `clothjax evaluate` measures its run")
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)

@@ -11,8 +11,10 @@ from toy import assert_same, small
 
 from clothjax.body import motion_clips
 from clothjax.config import LabelsConfig
+from clothjax.evaluation import report
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import descent, incremental_potential
+from clothjax.runtime import models, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
 from clothjax.training import imitation, labels, pipeline, pool, stage1
 from clothjax.training.labels import Labels
@@ -180,3 +182,21 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
     resumed, _ = pipeline.train_force_psi(stopped, first)
     assert_same(straight.state.params, resumed.state.params)
     assert_same(straight.state.normalizers, resumed.state.normalizers)
+
+
+@pytest.mark.slow
+def test_a_run_with_forces_is_tuned_and_measured_but_not_yet_used_elsewhere(toy, tmp_path):
+    config = toy[0].config
+    config = dataclasses.replace(
+        config,
+        stage1=dataclasses.replace(config.stage1, steps=20),
+        tuning=dataclasses.replace(config.tuning, steps=20, pool=2),
+        evaluation=dataclasses.replace(config.evaluation, frames=30),
+    )
+    pipeline.train(config, tmp_path)
+    measured = report.evaluate(tmp_path)["evaluation"]["psi"]
+    assert np.isfinite(measured["energy_gap"]) and measured["swing_ratio"] > 0
+    with pytest.raises(ValueError, match="does not run outside training yet"):
+        models.load(tmp_path)
+    with pytest.raises(ValueError, match="cannot be packed yet"):
+        trained.pack(tmp_path, tmp_path / "packed")
