@@ -324,6 +324,9 @@ class Stage2Config:
     latent_decay: float = 0.1
     """Share of the code that decays in a frame unless the network restores it. Without it, rollouts drift."""
     hidden: tuple[int, ...] = (512, 512)
+    forces: bool = False
+    """Psi reads the forces on the held garment in place of the pose, and learns from `labels` in place of rollouts of
+    Phi."""
     learning_rate: float = 1e-3
     clip: float = 1.0
     sequences: int = 96
@@ -335,6 +338,35 @@ class Stage2Config:
     seed: int = 0
 
     RETIRED: ClassVar[dict[str, Any]] = {"pushforward": False}
+
+
+@dataclass(frozen=True)
+class LabelsConfig:
+    """Labels of a Psi with forces: where the descent goes from states of Psi's own rollouts (DAgger)."""
+
+    rounds: int = 10
+    """Rounds of labelling and training, each with the Psi of the round before."""
+    sequences: int = 96
+    """Rollouts of a round, each of its own clip, betas and material."""
+    frames: int = 60
+    """Frames of a rollout."""
+    descent_steps: int = 64
+    """Most conjugate-gradient steps of a label. With 16 of them, cloth has half of its folds."""
+    tolerance: float = 1e-4
+    """Share of the energy gained that a label may leave."""
+    shares: tuple[float, ...] = (0.0, 0.5, 0.8, 1.0)
+    """How far the rollouts go from the label to Psi's own code; each rollout draws one."""
+    noise: float = 0.35
+    """Most noise on a whitened code, as its length in sqrt(J), in one frame of five."""
+    steps: int = 4000
+    """Training steps of a round."""
+    batch: int = 256
+    learning_rate: float = 5e-4
+    decay: float = 0.05
+    """Weight decay."""
+    ridge: float = 300.0
+    """Of the linear map's first value."""
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -376,6 +408,7 @@ class Config:
     shapes: ShapesConfig = field(default_factory=ShapesConfig)
     stage1: Stage1Config = field(default_factory=Stage1Config)
     stage2: Stage2Config = field(default_factory=Stage2Config)
+    labels: LabelsConfig = field(default_factory=LabelsConfig)
     tuning: TuningConfig = field(default_factory=TuningConfig)
     peer: PeerConfig = field(default_factory=PeerConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -386,4 +419,8 @@ class Config:
         _require(
             not self.peer.network or self.stage1.start_timestep == 0,
             "a baseline (peer.network) does not know the time step: set stage1.start_timestep to 0",
+        )
+        _require(
+            not self.stage2.forces or self.model.latent_update == "descent",
+            "stage2.forces needs the inverse Hessian of model.latent_update: descent",
         )

@@ -100,19 +100,14 @@ def _again(
 ) -> tuple[Callable, Callable, stage1.TrainingState]:
     """Return the training step of a stage, the function that finds the simulations of a step, and a state."""
     config = experiment.config
-    input_joints = psi.input_joints(experiment.names, config.stage2)
     if stage == "tuning":
         student = trained.psi(run)
         phi = trained.phi(run)[1]["params"]
-        animator = animators.psi_animator(
-            student.garment,
-            student.normalizers,
-            input_joints,
-            fine_tuning.preconditioners(experiment, clips, phi, student.normalizers, input_joints),
-        )
+        animator = fine_tuning.animator(experiment, clips, phi, student.garment, student.normalizers)
         config = fine_tuning.settings(config)
         state = fine_tuning.init(student.predictor, experiment.scene, clips, experiment.config)
     elif config.peer.network:
+        input_joints = psi.input_joints(experiment.names, config.stage2)
         animator = animators.baseline_animator(input_joints)
         state = stage1.init_baseline(
             experiment.scene, clips, input_joints, laplacian_shapes.laplacian(experiment.scene, config), config

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import cache
 from itertools import count
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from clothjax.evaluation.rollouts import (
 from clothjax.files import storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
+from clothjax.networks.normalisation import ForceScales
 from clothjax.networks.psi import input_joints
 from clothjax.progress import progress_bar
 from clothjax.runtime import models, trained
@@ -130,7 +132,18 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         compiled = play.lower(model, character, poses).compile()
         return lambda: np.asarray(compiled(model, character, poses))
 
+    @cache
+    def with_forces() -> Callable:
+        student = trained.psi(run)
+        assert isinstance(student.normalizers, ForceScales)
+        make = animators.force_psi_animator(student.garment, student.normalizers)
+        params = {"params": student.predictor}
+        play = jax.jit(lambda c, p: rollouts.states(make, params, experiment, c, p))
+        return lambda character, poses: np.asarray(play(character, poses))
+
     def psi(character: Character, clip: Motion):
+        if config.stage2.forces:
+            return lambda: with_forces()(character, windows(clip))
         loaded = models.load(run, betas=np.asarray(character.betas), material=character.material)
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import Config
-from clothjax.networks import baselines, decoder, mlp, normalisation, phi
+from clothjax.networks import baselines, decoder, forces, mlp, normalisation, phi
 from clothjax.networks.message_passing import Block
 from clothjax.networks.mlp import Params
-from clothjax.networks.normalisation import Normalizers
-from clothjax.networks.psi import Psi, constant_inputs, window_inputs
+from clothjax.networks.normalisation import ForceScales, Normalizers
+from clothjax.networks.psi import Psi, constant_inputs, next_code, window_inputs
 from clothjax.simulation.characters import Character
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
@@ -138,6 +138,33 @@ def psi_animator(
                 shown = precondition(gradients.code, latent)
             code, shown = (normalisation.denormalise(normalizers.latent, z) for z in (latent, shown))
             return StepOutput(phi.decode(garment, scene, character, shown, inputs.window, config.model), code)
+
+        return Animator(memory_size(scene, config), step)
+
+    return make
+
+
+def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
+    """Return a function that makes a Psi with forces, of `params`, the animator of a garment, with a frozen decoder.
+
+    Codes are clipped to their range; gradients pass as if none had been out of it. The inputs are constants.
+
+    Args:
+        garment: parameters of the decoder.
+    """
+
+    def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
+        constants = constant_inputs(character.betas, character.material, config.material)
+
+        def step(inputs: StepInput) -> StepOutput:
+            def decode(code: Array) -> Array:
+                return phi.decode(garment, scene, character, code, inputs.window, config.model)
+
+            held, change = jax.lax.stop_gradient((inputs.state.latent, inputs.state.change))
+            pulls = jax.lax.stop_gradient(forces.reduced(decode, held, inputs.time_step, scene.mesh, config.physics))
+            code = next_code(model["params"], scales, held, change, pulls, constants, config.stage2)
+            code += jax.lax.stop_gradient(jnp.clip(code, scales.low, scales.high) - code)
+            return StepOutput(decode(code), code)
 
         return Animator(memory_size(scene, config), step)
 

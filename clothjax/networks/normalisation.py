@@ -72,6 +72,23 @@ class Normalizers(NamedTuple):
     pose: Scale  # [P]
 
 
+class Whitening(NamedTuple):
+    """Maps between codes and whitened codes, in which the mean Hessian of the potential is the identity."""
+
+    to: Array  # [L, L] H^(1/2), symmetric: whitened = to @ code
+    back: Array  # [L, L] H^(-1/2), symmetric: code = back @ whitened
+
+
+class ForceScales(NamedTuple):
+    """Scales of a Psi with forces: of its inputs and its output, and the range of codes."""
+
+    inputs: Scale  # [N] of `force_inputs`
+    output: Array  # sqrt(J), the rms of an ordinary change of a whitened code
+    whitening: Whitening
+    low: Array  # [L] the least and ...
+    high: Array  # [L] ... the greatest code of the labels
+
+
 def identity(size: int) -> Scale:
     """Return the scale [size] that changes nothing: mean 0, deviation 1, and a range of +-1e6.
 

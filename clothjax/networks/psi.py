@@ -10,8 +10,10 @@ from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.material import material_inputs, scaled
 from clothjax.networks import mlp
 from clothjax.networks.mlp import MLP, Params
-from clothjax.networks.normalisation import bounded
+from clothjax.networks.normalisation import ForceScales, Whitening, bounded, normalise
 from clothjax.types import Array, Material, Pose
+
+BOUND = 5.0  # of scaled inputs of `ForcePsi`, approached softly: deep contact pushes thousands of times harder
 
 
 def input_joints(names: tuple[str, ...], config: Stage2Config) -> np.ndarray:
@@ -108,3 +110,46 @@ def init(key: Array, latent: int, pose: int, constants: int, config: Stage2Confi
         latent, pose, constants: sizes L, P and C of its inputs.
     """
     return mlp.init(Psi(config), key, jnp.zeros(latent), jnp.zeros(pose), jnp.zeros(constants))
+
+
+def force_inputs(code: Array, change: Array, forces: Array, constants: Array, whitening: Whitening) -> Array:
+    """Return the inputs [(2 + kinds) L + C] of `ForcePsi`, not yet scaled.
+
+    Args:
+        code: [L], held.
+        change: [L], of the code in the last frame.
+        forces: [kinds, L] in J, of `forces.reduced` at the held code.
+        constants: [C], of `constant_inputs`.
+    """
+    pulls = jnp.matmul(forces, whitening.back, precision="highest").reshape(-1)
+    return jnp.concatenate([code, jnp.matmul(change, whitening.to, precision="highest"), pulls, constants])
+
+
+class ForcePsi(nn.Module):
+    """The latent predictor of a Psi with forces: a linear map, which starts as the ridge solution, beside an MLP."""
+
+    config: Stage2Config
+    latent: int  # L
+
+    @nn.compact
+    def __call__(self, inputs: Array) -> Array:
+        """Return the change [..., L] of the whitened code, over `ForceScales.output`, from scaled inputs [..., N]."""
+        inputs = BOUND * jnp.tanh(inputs / BOUND)
+        linear = mlp.Dense(inputs.shape[-1], self.latent, name="linear")
+        layers = MLP((inputs.shape[-1], *self.config.hidden, self.latent), False, 1e-3, name="mlp")
+        return linear(inputs) + layers(inputs)
+
+
+def next_code(
+    params: Params,
+    scales: ForceScales,
+    code: Array,
+    change: Array,
+    forces: Array,
+    constants: Array,
+    config: Stage2Config,
+) -> Array:
+    """Return the next code [L] of a Psi with forces, not yet clipped to its range; arguments as of `force_inputs`."""
+    inputs = normalise(scales.inputs, force_inputs(code, change, forces, constants, scales.whitening))
+    moved = scales.output * mlp.apply(ForcePsi(config, len(code)), params, inputs)
+    return code + jnp.matmul(moved, scales.whitening.back, precision="highest")

@@ -1,6 +1,7 @@
 """Descent of the potential by preconditioned nonlinear conjugate gradients (METHOD.md, Descent)."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,46 @@ from clothjax.types import Array
 
 COLUMNS = 32  # columns of a Hessian that are computed together
 MAX_LENGTH = 4.0  # longest step, where 1 is right for the configured cloth at rest: others are softer or lighter
+
+
+class _Iterate(NamedTuple):
+    """A descent after some steps."""
+
+    latent: Array  # [L]
+    direction: Array  # [L] of the last step
+    gradient: Array  # [L] where that step began
+    steepest: Array  # [L] minus the preconditioned gradient there
+    energy: Array  # J, there
+
+
+def _step(
+    last: _Iterate,
+    precondition: Callable[[Array], Array],
+    garment: Callable[[Array], Array],
+    potential: Callable[[Array], Array],
+    bound: float,
+) -> _Iterate:
+    """Take one step of `descend`."""
+    x, pullback = jax.vjp(garment, last.latent)
+    (energy, force), hessian = jax.linearize(jax.value_and_grad(potential), x)
+    new = pullback(force)[0]
+    down = -precondition(new)
+    beta = jnp.sum(new * (last.steepest - down)) / jnp.maximum(-jnp.sum(last.gradient * last.steepest), 1e-12)
+    direction = down + jnp.maximum(beta, 0.0) * last.direction
+    direction = jnp.where(jnp.sum(new * direction) < 0, direction, down)
+    _, moved = jax.jvp(garment, (last.latent,), (direction,))
+    slope, curvature = jnp.maximum(-jnp.sum(moved * force), 0.0), jnp.sum(moved * hessian(moved)[1])
+    convex = curvature > 0
+    length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
+    push = jnp.where(slope > 0, length, 0.0) * direction
+    # deep collisions push thousands of times harder than the rest
+    push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / bound**2)
+    return _Iterate(last.latent + push, direction, new, down, energy)
+
+
+def _first(latent: Array) -> _Iterate:
+    zero = jnp.zeros_like(latent)
+    return _Iterate(latent, zero, zero, zero, jnp.zeros((), latent.dtype))
 
 
 def descend(
@@ -36,27 +77,44 @@ def descend(
         The last code [L].
     """
 
-    def step(carry, _):
-        latent, direction, gradient, steepest = carry
-        x, pullback = jax.vjp(garment, latent)
-        force, hessian = jax.linearize(jax.grad(potential), x)
-        new = pullback(force)[0]
-        down = -precondition(new)
-        beta = jnp.sum(new * (steepest - down)) / jnp.maximum(-jnp.sum(gradient * steepest), 1e-12)
-        direction = down + jnp.maximum(beta, 0.0) * direction
-        direction = jnp.where(jnp.sum(new * direction) < 0, direction, down)
-        _, moved = jax.jvp(garment, (latent,), (direction,))
-        slope, curvature = jnp.maximum(-jnp.sum(moved * force), 0.0), jnp.sum(moved * hessian(moved))
-        convex = curvature > 0
-        length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
-        push = jnp.where(slope > 0, length, 0.0) * direction
-        # deep collisions push thousands of times harder than the rest
-        push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / bound**2)
-        return (latent + push, direction, new, down), None
+    iterate, _ = jax.lax.scan(
+        lambda last, _: (_step(last, precondition, garment, potential, bound), None), _first(latent), None, length=steps
+    )
+    return iterate.latent
 
-    zero = jnp.zeros_like(latent)
-    (latent, *_), _ = jax.lax.scan(step, (latent, zero, zero, zero), None, length=steps)
-    return latent
+
+def converge(
+    precondition: Callable[[Array], Array],
+    latent: Array,
+    garment: Callable[[Array], Array],
+    potential: Callable[[Array], Array],
+    steps: int,
+    bound: float,
+    tolerance: float,
+) -> tuple[Array, Array]:
+    """Descend like `descend` until little energy is left to gain; it has no derivative in reverse mode.
+
+    Args:
+        steps: most steps.
+        tolerance: half of g^T P g that ends the descent, as a share of the energy gained so far, plus as much of 10 mJ.
+
+    Returns:
+        The last code [L], and the number of steps.
+    """
+    began = potential(garment(latent))
+
+    def goes_on(carry):
+        iterate, count = carry
+        left = -0.5 * jnp.sum(iterate.gradient * iterate.steepest)
+        gained = jnp.maximum(began - iterate.energy, 0.0)
+        return (count < steps) & ((count < 2) | (left > tolerance * (gained + 0.01)))
+
+    def step(carry):
+        iterate, count = carry
+        return _step(iterate, precondition, garment, potential, bound), count + 1
+
+    iterate, count = jax.lax.while_loop(goes_on, step, (_first(latent), jnp.int32(0)))
+    return iterate.latent, count
 
 
 def warm_start(

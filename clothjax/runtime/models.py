@@ -18,7 +18,7 @@ from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.files import storage
 from clothjax.networks import normalisation, psi
-from clothjax.networks.normalisation import Normalizers
+from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.runtime import trained
 from clothjax.types import Array, Body, Garment, Material
 
@@ -249,9 +249,12 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
         material: default the configured one.
 
     Raises:
-        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
+        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found, or if its Psi reads
+            forces.
     """
     run_psi = trained.psi(trained.find(run))
+    if isinstance(run_psi.normalizers, ForceScales):
+        raise ValueError(f"{run}: a Psi with forces does not run outside training yet; `clothjax evaluate` measures it")
     body, names = storage.load_rig(run_psi.config.body)
     return build(
         run_psi.config,

@@ -15,7 +15,7 @@ import yaml
 
 from clothjax.config import Config
 from clothjax.files import checkpoint, configuration, damage, storage
-from clothjax.networks.normalisation import Normalizers, Scale, Statistics, identity
+from clothjax.networks.normalisation import ForceScales, Normalizers, Scale, Statistics, Whitening, identity
 from clothjax.types import Material
 
 MODELS = storage.ASSETS / "models"
@@ -32,7 +32,7 @@ class TrainedPsi(NamedTuple):
     config: Config
     garment: dict  # parameters of the decoder with its blend shapes
     predictor: dict  # parameters of the latent predictor, after its last stage
-    normalizers: Normalizers  # scales of its codes and pose inputs
+    normalizers: Normalizers | ForceScales  # scales of its codes and inputs; the latter of a Psi with forces
 
 
 def shipped() -> tuple[str, ...]:
@@ -142,6 +142,8 @@ def pack(run: str | Path, out: str | Path) -> int:
     """
     config, model = phi(run)
     student = psi(run)
+    if isinstance(student.normalizers, ForceScales):
+        raise ValueError(f"{run}: a Psi with forces cannot be packed yet; `clothjax evaluate` measures its run")
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
@@ -197,7 +199,10 @@ def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
     return {name: Statistics(**each) for name, each in parts.items()}
 
 
-def _normalizers(parts: dict[str, dict]) -> Normalizers:
+def _normalizers(parts: dict[str, Any]) -> Normalizers | ForceScales:
+    if "whitening" in parts:
+        scales = parts | {"inputs": Scale(**parts["inputs"]), "whitening": Whitening(**parts["whitening"])}
+        return ForceScales(**scales)
     return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
 
 

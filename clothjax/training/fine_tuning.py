@@ -9,8 +9,9 @@ import numpy as np
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config, PhysicsTrainingConfig, Ramp, Stage1Config
 from clothjax.networks import normalisation
-from clothjax.networks.animators import Preconditioners
-from clothjax.networks.normalisation import Normalizers
+from clothjax.networks.animators import MakeAnimator, Preconditioners, force_psi_animator, psi_animator
+from clothjax.networks.normalisation import ForceScales, Normalizers
+from clothjax.networks.psi import input_joints
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.scene import Scene
 from clothjax.training import stage1, stage2
@@ -75,6 +76,22 @@ def code_preconditioner(inverse: np.ndarray, normalizers: Normalizers, power: fl
     values, vectors = np.linalg.eigh(np.asarray(inverse, np.float64) / np.outer(deviation, deviation))
     values = np.maximum(values, 1e-12 * values[-1]) ** power
     return jnp.asarray((vectors * values / np.sqrt(np.mean(values**2))) @ vectors.T, jnp.float32)
+
+
+def animator(
+    experiment: Experiment, clips: Clips, phi: dict, garment: dict, normalizers: Normalizers | ForceScales
+) -> MakeAnimator:
+    """Return what makes the Psi that is fine-tuned an animator, with the preconditioners of its gradients.
+
+    Args:
+        phi: parameters of Phi.
+        garment: parameters of the decoder.
+        normalizers: of Psi; `ForceScales` are those of a Psi with forces, whose whitening preconditions it.
+    """
+    if isinstance(normalizers, ForceScales):
+        return force_psi_animator(garment, normalizers)
+    joints = input_joints(experiment.names, experiment.config.stage2)
+    return psi_animator(garment, normalizers, joints, preconditioners(experiment, clips, phi, normalizers, joints))
 
 
 def preconditioners(

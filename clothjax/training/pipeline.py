@@ -17,15 +17,18 @@ from clothjax import progress
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.files import checkpoint, configuration
-from clothjax.networks import animators
-from clothjax.networks.normalisation import Normalizers
-from clothjax.networks.psi import input_joints
+from clothjax.material import configured_material
+from clothjax.networks import animators, forces
+from clothjax.networks.normalisation import ForceScales, Normalizers
+from clothjax.networks.psi import constant_inputs, input_joints
 from clothjax.progress import progress_bar
 from clothjax.simulation import assembly
 from clothjax.simulation.assembly import Experiment
 from clothjax.training import (
     devices,
     fine_tuning,
+    imitation,
+    labels,
     laplacian_shapes,
     loop,
     preconditioner,
@@ -39,7 +42,7 @@ STEPS_PER_CALL = 20
 PHYSICS = ("stage1", "tuning")  # stages in which the physics is the loss
 # settings that a stage does not read, so a run may change them and go on
 MAY_DIFFER = {
-    "stage1": ("directory", "evaluation", "stage2", "tuning"),
+    "stage1": ("directory", "evaluation", "stage2", "labels", "tuning"),
     "stage2": ("directory", "evaluation", "tuning"),
     "tuning": ("directory", "evaluation"),
     "baseline": ("directory", "evaluation"),
@@ -69,7 +72,7 @@ class Psi(NamedTuple):
 
     garment: dict  # parameters of Phi's decoder with its blend shapes, frozen
     predictor: dict  # parameters of the latent predictor
-    normalizers: Normalizers  # scales of its codes and pose inputs
+    normalizers: Normalizers | ForceScales  # scales of its codes and inputs
 
 
 def run_directory(config: Config, argv: list[str]) -> Path:
@@ -92,7 +95,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     if config.peer.network:
         return train_baseline(run)
     first = train_phi(run)
-    second, clock = train_psi(run, first)
+    second, clock = (train_force_psi if config.stage2.forces else train_psi)(run, first)
     clock |= {
         "stage1_seconds": first.seconds,
         "stage2_seconds": second.seconds,
@@ -172,6 +175,52 @@ def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]
     return fitted, _add_seconds(run, teacher_seconds=seconds)
 
 
+def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]]:
+    """Run stage 2 of a Psi with forces: rounds of labels and of training on all labels so far.
+
+    Also return the seconds of labelling. A round's labels stay in the run's folder; a run that is resumed reads them.
+
+    Raises:
+        ValueError: if fine-tuning has begun on another stage 2, or no frame could be labelled.
+    """
+    experiment, config = run.experiment, run.config
+    scene, settings, folder = experiment.scene, config.labels, run.directory / "stage2"
+    params = jax.device_get(phi.state.average)
+    whitening = forces.whitening(params["inverse_hessian"])
+    betas = np.zeros(scene.body.shapedirs.shape[-1], np.float32)
+    constants = constant_inputs(betas, configured_material(config), config.material)
+    state = imitation.blank(params["garment"], whitening, len(constants), config)
+    done = max(run.steps("stage2"), default=0)
+    files = [folder / f"labels_{number:02}.npz" for number in range(settings.rounds)]
+    progress.say(f"stage 2: the latent predictor with forces, {settings.rounds} rounds of {settings.steps} steps")
+    description = f"stage 2, {config.garment}"
+    if run.steps("tuning") and done < settings.rounds * settings.steps:
+        raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
+    fitted, clock = None, {}
+    if done and done % settings.steps == 0:
+        fitted = _fit(run, "stage2", lambda state: (state, {}), state, done, description)  # read, not trained
+    for number in range(done // settings.steps, settings.rounds):
+        if not files[number].is_file():
+            last = state if fitted is None else fitted.state
+            began = time.monotonic()
+            with progress_bar(f"labelling, round {number + 1}", settings.sequences) as report:
+                new = labels.collect(
+                    last.average, last.normalizers, params["garment"], params["inverse_hessian"], scene, run.clips,
+                    config, settings.seed + number, report, run.device_mesh,
+                )  # fmt: skip
+            folder.mkdir(parents=True, exist_ok=True)
+            labels.save(new, files[number])
+            clock = _add_seconds(run, teacher_seconds=time.monotonic() - began)
+            progress.say(f"{len(new.code)} frames; median hold gap of Psi in its own rollouts: {new.gap():.3f}")
+        scales = imitation.measure(labels.load(files[:1]), whitening)
+        known = labels.load(files[: number + 1])
+        begin = imitation.first(state, known, config) if number == 0 else state
+        update = imitation.make_update(known, scales, config, STEPS_PER_CALL, run.device_mesh)
+        fitted = _fit(run, "stage2", update, begin, (number + 1) * settings.steps, description)
+    assert fitted is not None
+    return fitted, clock
+
+
 def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
     """Run fine-tuning: train Psi on the loss of stage 1, in rollouts of its own.
 
@@ -181,9 +230,7 @@ def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:
     """
     experiment, config = run.experiment, run.config
     progress.say(f"tuning: the latent predictor on the physics, {config.tuning.steps} steps")
-    joints = input_joints(experiment.names, config.stage2)
-    gradients = fine_tuning.preconditioners(experiment, run.clips, phi, psi.normalizers, joints)
-    animator = animators.psi_animator(psi.garment, psi.normalizers, joints, gradients)
+    animator = fine_tuning.animator(experiment, run.clips, phi, psi.garment, psi.normalizers)
     settings = fine_tuning.settings(config)
     update = stage1.make_curriculum(experiment.scene, run.clips, settings, STEPS_PER_CALL, run.device_mesh, animator)
     state = fine_tuning.init(psi.predictor, experiment.scene, run.clips, config)

@@ -21,6 +21,7 @@ def sample(
     seed: int,
     progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
+    together: int = ON_CPU,
 ):
     """Compute `sequence(key, *arguments)` for many random keys; return the results on the host, with an axis [count].
 
@@ -30,10 +31,11 @@ def sample(
         count: number of keys, which come from `seed`.
         progress: called with the number of sequences done.
         device_mesh: each device runs a part of them.
+        together: keys in one program on a CPU; 1 for sequences that take different numbers of steps.
     """
     on_cpu = jax.default_backend() == "cpu"
     among = 1 if device_mesh is None else device_mesh.size
-    size = among * min(ON_CPU if on_cpu else ELSEWHERE, -(-count // among))
+    size = among * min(together if on_cpu else ELSEWHERE, -(-count // among))
     arguments = devices.replicate(arguments, device_mesh)
     keys = jax.random.split(jax.random.key(seed), count)
 

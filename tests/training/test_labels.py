@@ -1,0 +1,202 @@
+"""A Psi with forces: its inputs, its labels, its regression, and a run of both stages that is killed and resumed."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy import assert_same, small
+
+from clothjax.body import motion_clips
+from clothjax.config import LabelsConfig
+from clothjax.evaluation import report
+from clothjax.networks import animators, forces, phi
+from clothjax.physics import descent, incremental_potential
+from clothjax.runtime import models, trained
+from clothjax.simulation import assembly, characters, rollout, time_step
+from clothjax.training import imitation, labels, pipeline, pool, stage1
+from clothjax.training.labels import Labels
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """An experiment with forces, its clips, an untrained Phi's parameters, and a blank Psi."""
+    config = small()
+    config = dataclasses.replace(
+        config,
+        motions=("walk_0", "dance_0"),
+        stage2=dataclasses.replace(config.stage2, forces=True),
+        labels=LabelsConfig(rounds=2, sequences=2, frames=5, descent_steps=20, steps=20, batch=8),
+    )
+    experiment = assembly.assemble(config)
+    clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
+    params = stage1.init(experiment.scene, clips, config).params
+    whitening = forces.whitening(params["inverse_hessian"])
+    return experiment, clips, params, imitation.blank(params["garment"], whitening, 14, config)
+
+
+@pytest.fixture(scope="module")
+def problem(toy):
+    """A time step of a moving garment: from a code to vertices, the step, and a code that moves them."""
+    experiment, clips, params, _ = toy
+    scene, config = experiment.scene, experiment.config
+    simulation = pool.begin(jax.random.key(3), scene, clips, config)
+    character = pool.dressed(scene, simulation.betas, simulation.material, config)
+    window = characters.window(scene, character, motion_clips.poses(clips, simulation.frame))
+    step = time_step.time_step(scene, character, simulation.cloth, window, jnp.float32(1 / config.fps), config)
+    garment = partial(phi.decode, params["garment"], scene, character, window=window, config=config.model)
+    code = 0.3 * jax.random.normal(jax.random.key(4), simulation.cloth.latent.shape)
+    return scene, config, lambda z: garment(latent=z), step, code
+
+
+def test_forces_are_minus_the_gradient_of_the_potential(problem):
+    scene, config, garment, step, code = problem
+    kinds = forces.reduced(garment, code, step, scene.mesh, config.physics)
+    gradient = jax.grad(lambda z: incremental_potential.potential(garment(z), step, scene.mesh, config.physics))(code)
+    np.testing.assert_allclose(kinds.sum(0), -gradient, atol=1e-4 * float(jnp.abs(gradient).max()))
+    assert (np.abs(kinds).max(axis=1) > 0).all()  # each kind is there
+
+
+def test_whitening_makes_the_mean_hessian_the_identity():
+    mixed = np.random.default_rng(0).normal(size=(30, 30))
+    hessian = mixed @ mixed.T + np.eye(30)
+    whitening = forces.whitening(np.linalg.inv(hessian))
+    np.testing.assert_allclose(whitening.back @ whitening.to, np.eye(30), atol=1e-5)
+    np.testing.assert_allclose(np.asarray(whitening.back) @ hessian @ np.asarray(whitening.back), np.eye(30), atol=1e-4)
+
+
+def test_a_descent_that_converges_stops_sooner_where_the_start_is_better(problem):
+    scene, config, garment, step, code = problem
+
+    def potential(new):
+        return incremental_potential.potential(new, step, scene.mesh, config.physics)
+
+    inverse = jnp.eye(len(code))
+
+    @jax.jit
+    def converged(start):
+        return descent.converge(lambda g: inverse @ g, start, garment, potential, 200, 1.0, 1e-3)
+
+    end, count = converged(code)
+    near, fewer = converged(end)
+    assert float(potential(garment(end))) < float(potential(garment(code)))
+    assert int(fewer) < int(count)
+    assert float(potential(garment(near))) <= float(potential(garment(end))) * (1 + 1e-5)
+
+
+def collected(toy, state, seed=0) -> Labels:
+    experiment, clips, params, _ = toy
+    return labels.collect(
+        state.params, state.normalizers, params["garment"], params["inverse_hessian"],
+        experiment.scene, clips, experiment.config, seed,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def round_of(toy):
+    return collected(toy, toy[3])
+
+
+def test_a_blank_psi_holds_the_code_and_labels_take_energy_from_it(round_of):
+    np.testing.assert_array_equal(round_of.predicted, round_of.held)
+    assert len(round_of.code) == 10 and (round_of.least < round_of.held).all()
+    assert round_of.gap() == pytest.approx(1.0)
+
+
+def test_labels_survive_a_file(round_of, tmp_path):
+    for name in ("a.npz", "b.npz"):
+        labels.save(round_of, tmp_path / name)
+    both = labels.load([tmp_path / "a.npz", tmp_path / "b.npz"])
+    np.testing.assert_array_equal(both.forces[10:], round_of.forces)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
+
+
+def test_examples_say_where_the_labels_go(toy, round_of):
+    whitening = toy[3].normalizers.whitening
+    scales = imitation.measure(round_of, whitening)
+    _, targets = imitation.examples(round_of, scales)
+    reached = round_of.code + float(scales.output) * targets @ np.asarray(whitening.back)
+    np.testing.assert_allclose(reached, round_of.target, atol=1e-3 * np.abs(round_of.target).max())
+
+
+def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
+    """With hardly any ridge and fewer frames than inputs, it fits every frame."""
+    experiment, *_, blank = toy
+    config = dataclasses.replace(
+        experiment.config,
+        labels=dataclasses.replace(experiment.config.labels, ridge=1e-6),
+        stage2=experiment.config.stage2,
+    )
+    state = imitation.first(blank, round_of, config)
+    inputs, targets = imitation.examples(round_of, state.normalizers)
+    bounded = 5.0 * np.tanh(inputs / 5.0)
+    fitted = bounded @ np.asarray(state.params["linear"]["kernel"]) + np.asarray(state.params["linear"]["bias"])
+    np.testing.assert_allclose(fitted, targets, atol=0.02)
+
+
+def test_the_animator_takes_the_step_of_the_labelled_psi(toy, round_of):
+    """The code that a rollout stores is the one that labelling counts as Psi's."""
+    experiment, clips, params, blank = toy
+    state = imitation.first(blank, round_of, experiment.config)
+    new = collected(toy, state, 5)
+    assert (new.predicted != new.held).all()
+    scene, config = experiment.scene, experiment.config
+    make = animators.force_psi_animator(params["garment"], state.normalizers)
+
+    key, *_ = jax.random.split(jax.random.split(jax.random.key(5), 2)[0], 3)
+    simulation = pool.begin(key, scene, clips, config)
+    character = pool.dressed(scene, simulation.betas, simulation.material, config)
+    poses = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
+
+    @jax.jit
+    def energy():
+        animator = make({"params": state.params}, scene, character, config)
+        _, taken = rollout.take(animator, scene, character, simulation.cloth, poses, 1 / config.fps, config)
+        return incremental_potential.potential(taken.position, taken.time_step, scene.mesh, config.physics)
+
+    np.testing.assert_allclose(energy(), new.predicted[0], rtol=1e-3)
+
+
+def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(toy, tmp_path, monkeypatch):
+    config = dataclasses.replace(toy[0].config, stage1=dataclasses.replace(toy[0].config.stage1, steps=20))
+    whole = pipeline.prepare(config, tmp_path / "whole")
+    first = pipeline.train_phi(whole)
+    straight, _ = pipeline.train_force_psi(whole, first)
+    assert int(straight.state.step) == 40
+
+    stopped = whole._replace(directory=tmp_path / "stopped")
+    first = pipeline.train_phi(stopped)
+    collect = labels.collect
+
+    def once(*arguments):
+        if arguments[7] > 0:
+            raise KeyboardInterrupt
+        return collect(*arguments)
+
+    monkeypatch.setattr(labels, "collect", once)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.train_force_psi(stopped, first)
+    monkeypatch.setattr(labels, "collect", collect)
+    resumed, _ = pipeline.train_force_psi(stopped, first)
+    assert_same(straight.state.params, resumed.state.params)
+    assert_same(straight.state.normalizers, resumed.state.normalizers)
+
+
+@pytest.mark.slow
+def test_a_run_with_forces_is_tuned_and_measured_but_not_yet_used_elsewhere(toy, tmp_path):
+    config = toy[0].config
+    config = dataclasses.replace(
+        config,
+        stage1=dataclasses.replace(config.stage1, steps=20),
+        tuning=dataclasses.replace(config.tuning, steps=20, pool=2),
+        evaluation=dataclasses.replace(config.evaluation, frames=30),
+    )
+    pipeline.train(config, tmp_path)
+    measured = report.evaluate(tmp_path)["evaluation"]["psi"]
+    assert np.isfinite(measured["energy_gap"]) and measured["swing_ratio"] > 0
+    with pytest.raises(ValueError, match="does not run outside training yet"):
+        models.load(tmp_path)
+    with pytest.raises(ValueError, match="cannot be packed yet"):
+        trained.pack(tmp_path, tmp_path / "packed")
