@@ -40,9 +40,17 @@ def _run_onnx(path: Path, model: Model, motion: Motion, options: Options) -> np.
     return onnx.run_onnx(path, model, motion) if options.output == "world" else None
 
 
+def _of_litert(model: Model, options: Options) -> Model:
+    """Return the model whose code the file carries."""
+    return specialise.equalised(model) if options.int8 else model
+
+
 def _write_litert(model: Model, path: Path, options: Options, about: dict) -> None:
-    model = specialise.equalised(model) if options.int8 else model
-    litert.to_litert(model, path, int8=options.int8, about=about)
+    litert.to_litert(_of_litert(model, options), path, int8=options.int8, about=about)
+
+
+def _run_litert(path: Path, model: Model, motion: Motion, options: Options) -> np.ndarray:
+    return litert.run_litert(path, _of_litert(model, options), motion)
 
 
 def _run_c(path: Path, _model: Model, motion: Motion, _options: Options) -> np.ndarray | None:
@@ -67,9 +75,7 @@ FORMATS = {
         lambda model, path, _, about: stablehlo.to_stablehlo(model, path, about),
         lambda path, model, motion, _: stablehlo.run_stablehlo(path, model, motion),
     ),
-    "litert": Format(
-        "tflite", _write_litert, lambda path, model, motion, _: litert.run_litert(path, model, motion), ("int8",)
-    ),
+    "litert": Format("tflite", _write_litert, _run_litert, ("int8",)),
     "c": Format(
         "psi", lambda model, path, _, about: native.to_c(model, path, about), _run_c, not_run="there is no C compiler"
     ),
