@@ -29,11 +29,7 @@ def principal(frames: np.ndarray, scene: Scene, config: Config) -> np.ndarray:
     Each is scaled to the energy of a shape of `laplacian_shapes.laplacian`.
 
     Args:
-        progress: called with the number of simulations done.
-        device_mesh: each device simulates a part of them.
-
-    Raises:
-        ValueError: as `simulate`.
+        frames: [N, T, V, 3] m, of `simulate`.
     """
     rows = frames.reshape(-1, frames[0, 0].size).astype(np.float64)
     count = min(config.model.blendshapes, len(rows), rows.shape[1])
