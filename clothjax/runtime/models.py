@@ -45,7 +45,7 @@ class Bounds(NamedTuple):
 
     low: Array
     high: Array
-    slack: Array
+    slack: Array  # how far out still counts as inside
 
 
 class Network(NamedTuple):
