@@ -326,7 +326,7 @@ class Stage2Config:
     hidden: tuple[int, ...] = (512, 512)
     forces: bool = False
     """Psi reads the forces on the held garment in place of the pose, and learns from `labels` in place of rollouts of
-    Phi."""
+    Phi. Fine-tuning then needs a tenth of the usual rate. The runtime and the exports do not have it yet."""
     learning_rate: float = 1e-3
     clip: float = 1.0
     sequences: int = 96
@@ -367,6 +367,10 @@ class LabelsConfig:
     ridge: float = 300.0
     """Of the linear map's first value."""
     seed: int = 0
+
+    def __post_init__(self):
+        _require(self.rounds >= 1, f"labels.rounds must be >= 1, got {self.rounds}")
+        _require(all(0 <= share <= 1 for share in self.shares), f"labels.shares must be in [0, 1]: {self.shares}")
 
 
 @dataclass(frozen=True)

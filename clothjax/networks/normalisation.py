@@ -82,7 +82,8 @@ class Whitening(NamedTuple):
 class ForceScales(NamedTuple):
     """Scales of a Psi with forces: of its inputs and its output, and the range of codes."""
 
-    inputs: Scale  # [N] of `force_inputs`
+    middle: Array  # [N] medians of `psi.force_inputs`, subtracted first
+    spread: Array  # [N] their spread, divided by
     output: Array  # sqrt(J), the rms of an ordinary change of a whitened code
     whitening: Whitening
     low: Array  # [L] the least and ...

@@ -10,7 +10,7 @@ from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.material import material_inputs, scaled
 from clothjax.networks import mlp
 from clothjax.networks.mlp import MLP, Params
-from clothjax.networks.normalisation import ForceScales, Whitening, bounded, normalise
+from clothjax.networks.normalisation import ForceScales, Whitening, bounded
 from clothjax.types import Array, Material, Pose
 
 BOUND = 5.0  # of scaled inputs of `ForcePsi`, approached softly: deep contact pushes thousands of times harder
@@ -125,6 +125,11 @@ def force_inputs(code: Array, change: Array, forces: Array, constants: Array, wh
     return jnp.concatenate([code, jnp.matmul(change, whitening.to, precision="highest"), pulls, constants])
 
 
+def scaled_inputs(scales: ForceScales, inputs: Array) -> Array:
+    """Return inputs [N] of `force_inputs`, scaled and softly bounded to +-`BOUND`."""
+    return BOUND * jnp.tanh((inputs - scales.middle) / (BOUND * scales.spread))
+
+
 class ForcePsi(nn.Module):
     """The latent predictor of a Psi with forces: a linear map, which starts as the ridge solution, beside an MLP."""
 
@@ -133,8 +138,7 @@ class ForcePsi(nn.Module):
 
     @nn.compact
     def __call__(self, inputs: Array) -> Array:
-        """Return the change [..., L] of the whitened code, over `ForceScales.output`, from scaled inputs [..., N]."""
-        inputs = BOUND * jnp.tanh(inputs / BOUND)
+        """Return the change [..., L] of the whitened code, over `ForceScales.output`, from `scaled_inputs` [..., N]."""
         linear = mlp.Dense(inputs.shape[-1], self.latent, name="linear")
         layers = MLP((inputs.shape[-1], *self.config.hidden, self.latent), False, 1e-3, name="mlp")
         return linear(inputs) + layers(inputs)
@@ -150,6 +154,6 @@ def next_code(
     config: Stage2Config,
 ) -> Array:
     """Return the next code [L] of a Psi with forces, not yet clipped to its range; arguments as of `force_inputs`."""
-    inputs = normalise(scales.inputs, force_inputs(code, change, forces, constants, scales.whitening))
+    inputs = scaled_inputs(scales, force_inputs(code, change, forces, constants, scales.whitening))
     moved = scales.output * mlp.apply(ForcePsi(config, len(code)), params, inputs)
     return code + jnp.matmul(moved, scales.whitening.back, precision="highest")

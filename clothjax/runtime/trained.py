@@ -201,8 +201,7 @@ def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
 
 def _normalizers(parts: dict[str, Any]) -> Normalizers | ForceScales:
     if "whitening" in parts:
-        scales = parts | {"inputs": Scale(**parts["inputs"]), "whitening": Whitening(**parts["whitening"])}
-        return ForceScales(**scales)
+        return ForceScales(**parts | {"whitening": Whitening(**parts["whitening"])})
     return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
 
 

@@ -10,9 +10,9 @@ import optax
 from jax.sharding import Mesh
 
 from clothjax.config import Config
-from clothjax.networks import mlp, normalisation, psi
+from clothjax.networks import mlp, psi
 from clothjax.networks.forces import KINDS
-from clothjax.networks.normalisation import ForceScales, Scale, Whitening
+from clothjax.networks.normalisation import ForceScales, Whitening
 from clothjax.networks.psi import ForcePsi
 from clothjax.training import loop
 from clothjax.training.labels import Labels
@@ -46,10 +46,9 @@ def blank(garment: dict, whitening: Whitening, constants: int, config: Config) -
     key, model_key = jax.random.split(jax.random.key(config.labels.seed))
     params = mlp.init(ForcePsi(config.stage2, latent), model_key, jnp.zeros(size))
     params = params | {"linear": jax.tree.map(jnp.zeros_like, params["linear"])}
-    scale, far = normalisation.identity(size), jnp.full(latent, 1e6)
-    scales = ForceScales(
-        jax.tree.map(jnp.asarray, scale), jnp.float32(0.0), jax.tree.map(jnp.array, whitening), -far, jnp.array(far)
-    )
+    far = jnp.full(latent, 1e6)
+    whitening = jax.tree.map(jnp.array, whitening)
+    scales = ForceScales(jnp.zeros(size), jnp.ones(size), jnp.float32(0.0), whitening, -far, jnp.array(far))
     average = jax.tree.map(jnp.array, params)
     garment = jax.tree.map(jnp.array, garment)
     return TrainingState(jnp.int32(0), key, params, average, optimizer(config).init(params), scales, garment)
@@ -59,8 +58,7 @@ def first(state: TrainingState, labels: Labels, config: Config) -> TrainingState
     """Return the state before the first training step: scales measured on the labels, the linear map by ridge."""
     scales = measure(labels, state.normalizers.whitening)
     inputs, targets = (np.asarray(part, np.float64) for part in examples(labels, scales))
-    inputs = psi.BOUND * np.tanh(inputs / psi.BOUND)
-    weights = weight(targets, np)[:, None]
+    weights = weight(targets)[:, None]
     bordered = np.concatenate([inputs, np.ones((len(inputs), 1))], axis=1)
     penalty = np.diag([config.labels.ridge] * inputs.shape[1] + [1e-3])
     solution = np.linalg.solve((weights * bordered).T @ bordered + penalty, (weights * bordered).T @ targets)
@@ -73,27 +71,24 @@ def measure(labels: Labels, whitening: Whitening) -> ForceScales:
     """Measure the scales of labels. Medians and quantiles: forces of contact have long tails."""
     inputs = _inputs(labels, whitening)
     middle = np.median(inputs, axis=0)
-    spread = 1.5 * np.quantile(np.abs(inputs - middle), 0.84, axis=0)
-    spread = np.maximum(np.minimum(inputs.std(axis=0), spread), 1e-6)
-    changes = (labels.target - labels.code) @ np.asarray(whitening.to)
-    size = np.median(np.sqrt(np.mean(changes**2, axis=1)))
+    quantile = np.quantile(np.abs(inputs - middle), 0.84, axis=0)
+    spread = np.maximum(np.minimum(inputs.std(axis=0), 1.5 * quantile), 1e-6)
+    size = np.median(np.sqrt(np.mean(_changes(labels, whitening) ** 2, axis=1)))
     low, high = labels.target.min(axis=0), labels.target.max(axis=0)
     margin = WIDER * (high - low)
-    return ForceScales(
-        inputs=Scale(*(jnp.asarray(x, jnp.float32) for x in (middle, spread, (inputs.min(0) - middle) / spread,
-                                                             (inputs.max(0) - middle) / spread))),
-        output=jnp.float32(size),
-        whitening=whitening,
-        low=jnp.asarray(low - margin, jnp.float32),
-        high=jnp.asarray(high + margin, jnp.float32),
-    )  # fmt: skip
+    numbers = (jnp.asarray(x, jnp.float32) for x in (middle, spread, size))
+    return ForceScales(*numbers, whitening, jnp.asarray(low - margin), jnp.asarray(high + margin))
 
 
 def examples(labels: Labels, scales: ForceScales) -> tuple[np.ndarray, np.ndarray]:
     """Return scaled inputs [n, N] and targets [n, L] of the labels."""
-    inputs = (_inputs(labels, scales.whitening) - np.asarray(scales.inputs.mean)) / np.asarray(scales.inputs.deviation)
-    targets = (labels.target - labels.code) @ np.asarray(scales.whitening.to) / float(scales.output)
-    return np.asarray(inputs, np.float32), np.asarray(targets, np.float32)
+    inputs = jax.vmap(psi.scaled_inputs, (None, 0))(scales, _inputs(labels, scales.whitening))
+    return np.asarray(inputs), _changes(labels, scales.whitening) / np.float32(scales.output)
+
+
+def _changes(labels: Labels, whitening: Whitening) -> np.ndarray:
+    """Return the changes [n, L] sqrt(J) of the whitened code that the labels ask for."""
+    return (labels.target - labels.code) @ np.asarray(whitening.to)
 
 
 def _inputs(labels: Labels, whitening: Whitening) -> np.ndarray:
@@ -102,9 +97,9 @@ def _inputs(labels: Labels, whitening: Whitening) -> np.ndarray:
     return np.asarray(rows(labels.code, labels.change, labels.forces, labels.constants, whitening))
 
 
-def weight(targets: Array, module=jnp) -> Array:
+def weight(targets: Array) -> Array:
     """Return weights [n] of frames by their targets [n, L]: large changes must not drown small ones."""
-    return 1.0 / (SMALL + module.mean(targets**2, axis=-1))
+    return 1.0 / (SMALL + (targets**2).mean(axis=-1))
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:

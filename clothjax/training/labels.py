@@ -1,5 +1,7 @@
 """Labelled frames: where the descent would take states of Psi's own rollouts (DAgger, Ross et al. 2011)."""
 
+import json
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +14,7 @@ from jax.sharding import Mesh
 from clothjax.body import motion_clips
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
+from clothjax.files import damage
 from clothjax.networks import forces, phi, psi
 from clothjax.networks.normalisation import ForceScales
 from clothjax.physics import descent, incremental_potential
@@ -148,18 +151,39 @@ def collect(
     return Labels(*(part[good] for part in flat))
 
 
-def save(labels: Labels, path: Path) -> None:
-    """Write labels to a file, whole or not at all."""
+def fingerprint(settings: dict, params: dict) -> int:
+    """Return a number that tells labels of other settings, or of another Phi, apart.
+
+    Args:
+        settings: those that labels depend on, as `configuration.to_dict` gives them.
+        params: of Phi.
+    """
+    leaves = jax.tree.leaves((params["garment"], params["inverse_hessian"]))
+    return zlib.crc32(b"".join([json.dumps(settings).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)]))
+
+
+def save(labels: Labels, path: Path, of: int) -> None:
+    """Write labels to a file with their `fingerprint`, whole or not at all."""
     partial = path.with_name(f".{path.name}")
     with partial.open("wb") as file:
-        np.savez(file, **labels._asdict())
+        np.savez(file, **labels._asdict(), of=of)
     partial.replace(path)
 
 
-def load(paths: list[Path]) -> Labels:
-    """Read the labels of several files as one."""
+def load(paths: list[Path], of: int) -> Labels:
+    """Read the labels of several files as one.
+
+    Raises:
+        ValueError: for a file that is missing, damaged or of another `fingerprint`.
+    """
     parts = []
     for path in paths:
-        with np.load(path, allow_pickle=False) as file:
-            parts.append(Labels(*(file[name] for name in Labels._fields)))
+        try:
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+                same = int(file["of"]) == of
+                parts.append(Labels(*(file[name] for name in Labels._fields)))
+        except damage.UNREADABLE as error:
+            raise ValueError(f"{path}: not readable labels ({error}); remove {path.parent} to begin anew") from error
+        if not same:
+            raise ValueError(f"{path}: of other settings or of another Phi; remove {path.parent} to begin anew")
     return Labels(*(np.concatenate(each) for each in zip(*parts, strict=True)))

@@ -196,11 +196,13 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     description = f"stage 2, {config.garment}"
     if run.steps("tuning") and done < settings.rounds * settings.steps:
         raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
+    settings_read = {
+        name: value for name, value in configuration.to_dict(config).items() if name not in MAY_DIFFER["stage2"]
+    }
+    of = labels.fingerprint(settings_read, params)
     fitted, clock = None, {}
-    if done and done % settings.steps == 0:
-        fitted = _fit(run, "stage2", lambda state: (state, {}), state, done, description)  # read, not trained
-    for number in range(done // settings.steps, settings.rounds):
-        if not files[number].is_file():
+    for number in range(max(done - 1, 0) // settings.steps, settings.rounds):  # from the newest checkpoint's round on
+        if done <= number * settings.steps and not files[number].is_file():
             last = state if fitted is None else fitted.state
             began = time.monotonic()
             with progress_bar(f"labelling, round {number + 1}", settings.sequences) as report:
@@ -209,11 +211,11 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
                     config, settings.seed + number, report, run.device_mesh,
                 )  # fmt: skip
             folder.mkdir(parents=True, exist_ok=True)
-            labels.save(new, files[number])
+            labels.save(new, files[number], of)
             clock = _add_seconds(run, teacher_seconds=time.monotonic() - began)
             progress.say(f"{len(new.code)} frames; median hold gap of Psi in its own rollouts: {new.gap():.3f}")
-        scales = imitation.measure(labels.load(files[:1]), whitening)
-        known = labels.load(files[: number + 1])
+        scales = imitation.measure(labels.load(files[:1], of), whitening)
+        known = labels.load(files[: number + 1], of)
         begin = imitation.first(state, known, config) if number == 0 else state
         update = imitation.make_update(known, scales, config, STEPS_PER_CALL, run.device_mesh)
         fitted = _fit(run, "stage2", update, begin, (number + 1) * settings.steps, description)

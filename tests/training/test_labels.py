@@ -107,10 +107,23 @@ def test_a_blank_psi_holds_the_code_and_labels_take_energy_from_it(round_of):
 
 def test_labels_survive_a_file(round_of, tmp_path):
     for name in ("a.npz", "b.npz"):
-        labels.save(round_of, tmp_path / name)
-    both = labels.load([tmp_path / "a.npz", tmp_path / "b.npz"])
+        labels.save(round_of, tmp_path / name, 7)
+    both = labels.load([tmp_path / "a.npz", tmp_path / "b.npz"], 7)
     np.testing.assert_array_equal(both.forces[10:], round_of.forces)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
+
+
+def test_labels_of_something_else_and_damaged_ones_are_refused(toy, round_of, tmp_path):
+    params = toy[2]
+    of = labels.fingerprint({"a": 1}, params)
+    labels.save(round_of, tmp_path / "a.npz", of)
+    other = params | {"inverse_hessian": 2.0 * params["inverse_hessian"]}
+    for settings, network in (({"a": 2}, params), ({"a": 1}, other)):
+        with pytest.raises(ValueError, match=r"a\.npz: of other settings or of another Phi; remove"):
+            labels.load([tmp_path / "a.npz"], labels.fingerprint(settings, network))
+    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"a\.npz: not readable labels"):
+        labels.load([tmp_path / "a.npz"], of)
 
 
 def test_examples_say_where_the_labels_go(toy, round_of):
@@ -131,8 +144,7 @@ def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
     )
     state = imitation.first(blank, round_of, config)
     inputs, targets = imitation.examples(round_of, state.normalizers)
-    bounded = 5.0 * np.tanh(inputs / 5.0)
-    fitted = bounded @ np.asarray(state.params["linear"]["kernel"]) + np.asarray(state.params["linear"]["bias"])
+    fitted = inputs @ np.asarray(state.params["linear"]["kernel"]) + np.asarray(state.params["linear"]["bias"])
     np.testing.assert_allclose(fitted, targets, atol=0.02)
 
 
@@ -180,6 +192,8 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
         pipeline.train_force_psi(stopped, first)
     monkeypatch.setattr(labels, "collect", collect)
     resumed, _ = pipeline.train_force_psi(stopped, first)
+    monkeypatch.setattr(labels, "collect", once)  # a finished one is read
+    assert_same(resumed.state.params, pipeline.train_force_psi(stopped, first)[0].state.params)
     assert_same(straight.state.params, resumed.state.params)
     assert_same(straight.state.normalizers, resumed.state.normalizers)
 
