@@ -344,21 +344,26 @@ class Stage2Config:
 class LabelsConfig:
     """Labels of a Psi with forces: where the descent goes from states of Psi's own rollouts (DAgger)."""
 
-    rounds: int = 10
-    """Rounds of labelling and training, each with the Psi of the round before."""
-    sequences: int = 96
-    """Rollouts of a round, each of its own clip, betas and material."""
-    frames: int = 60
-    """Frames of a rollout."""
-    descent_steps: int = 64
-    """Most conjugate-gradient steps of a label. With 16 of them, cloth has half of its folds."""
+    rounds: int = 40
+    """Rounds of labelling and training, each with the Psi of the round before. All frames stay in memory, 10 kB each
+    for a garment of 1 000 vertices."""
+    simulations: int = 256
+    """Simulations that are labelled in a round, each of its own clip, betas and material. They go on in the next."""
+    frames: int = 30
+    """Frames by which a round moves a simulation."""
+    renewed: float = 0.1
+    """Share of the simulations that begin anew after a round."""
+    descent_steps: int = 20
+    """Most conjugate-gradient steps of a label. They start where Psi is, so that later rounds go on from earlier."""
     tolerance: float = 1e-4
     """Share of the energy gained that a label may leave."""
-    shares: tuple[float, ...] = (0.0, 0.5, 0.8, 1.0)
-    """How far the rollouts go from the label to Psi's own code; each rollout draws one."""
+    shares: tuple[float, ...] = (0.3, 0.7, 0.9, 1.0, 1.0)
+    """How far a simulation goes from the label to Psi's own code; each draws one in a round."""
     noise: float = 0.35
     """Most noise on a whitened code, as its length in sqrt(J), in one frame of five."""
-    steps: int = 4000
+    external: float = 12.0
+    """Largest external acceleration in m/s^2, such as wind; about one simulation of seven draws one in a round."""
+    steps: int = 500
     """Training steps of a round."""
     batch: int = 256
     learning_rate: float = 5e-4

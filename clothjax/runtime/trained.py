@@ -201,7 +201,8 @@ def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
 
 def _normalizers(parts: dict[str, Any]) -> Normalizers | ForceScales:
     if "whitening" in parts:
-        return ForceScales(**parts | {"whitening": Whitening(**parts["whitening"])})
+        arrays = dict(parts)
+        return ForceScales(whitening=Whitening(**arrays.pop("whitening")), **arrays)
     return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
 
 

@@ -31,13 +31,20 @@ def start(character: Character, window: Window, memory_size: int) -> ClothState:
 
 
 def time_step(
-    scene: Scene, character: Character, state: ClothState, window: Window, timestep: Scalar, config: Config
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    window: Window,
+    timestep: Scalar,
+    config: Config,
+    external: Array | None = None,
 ) -> TimeStep:
     """Return the constants of the potential of a time step from `window.current` to `window.following`.
 
     Args:
         state: of the garment at the current frame.
         timestep: s, the duration.
+        external: [3] m/s^2, an acceleration of the cloth beside gravity, such as wind or a frame that falls.
     """
     physics = config.physics
     body, body_next = window.current.body, window.following.body
@@ -58,7 +65,7 @@ def time_step(
         on_self = contact_search.find_on_self(state.position, scene.garment_patches)
     return TimeStep(
         position=state.position,
-        velocity=state.velocity,
+        velocity=state.velocity if external is None else state.velocity + timestep**2 * external[None],
         mass=character.mass,
         rest=character.rest,
         material=character.material,

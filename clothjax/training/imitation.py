@@ -1,6 +1,7 @@
 """Stage 2 of a Psi with forces: regression on labelled frames, round after round (METHOD.md, Psi with forces)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,6 +21,17 @@ from clothjax.types import Array
 
 SMALL = 0.3  # of the mean square of an ordinary change; frames that change less weigh no more
 WIDER = 0.1  # of the range of the labels' codes, which Psi may go beyond at either end
+SETTLING = 0.35  # share of the training steps, the last ones, in which the learning rate falls
+
+
+class Data(NamedTuple):
+    """The frames to learn from: those of the rounds so far, in arrays that have room for all rounds."""
+
+    inputs: Array  # [n, N] of `psi.scaled_inputs`
+    targets: Array  # [n, L] whitened changes over `ForceScales.output`
+    count: Array  # int32, of the frames that are there
+    low: Array  # [L] the least code that Psi may give, from those frames, and ...
+    high: Array  # [L] ... the greatest
 
 
 class TrainingState(NamedTuple):
@@ -74,10 +86,41 @@ def measure(labels: Labels, whitening: Whitening) -> ForceScales:
     quantile = np.quantile(np.abs(inputs - middle), 0.84, axis=0)
     spread = np.maximum(np.minimum(inputs.std(axis=0), 1.5 * quantile), 1e-6)
     size = np.median(np.sqrt(np.mean(_changes(labels, whitening) ** 2, axis=1)))
+    middle, spread, size = (jnp.asarray(x, jnp.float32) for x in (middle, spread, size))
+    low, high = map(jnp.asarray, _range(labels))
+    return ForceScales(middle, spread, size, whitening, low, high)
+
+
+def room(labels: Labels, scales: ForceScales, config: Config) -> Data:
+    """Return data without frames, with room for as many rounds as the first one's labels."""
+    rows = config.labels.rounds * len(labels.code)
+    inputs, targets = jnp.zeros((rows, len(scales.middle))), jnp.zeros((rows, len(scales.low)))
+    return Data(inputs, targets, jnp.int32(0), jnp.array(scales.low), jnp.array(scales.high))
+
+
+def extended(data: Data, labels: Labels, scales: ForceScales) -> Data:
+    """Return data with the frames of one more round, and with its codes in the range; `data` is used up."""
+    inputs, targets = examples(labels, scales)
+    low, high = _range(labels)
+    return Data(
+        inputs=_put(data.inputs, inputs, data.count),
+        targets=_put(data.targets, targets, data.count),
+        count=data.count + len(inputs),
+        low=jnp.minimum(data.low, low),
+        high=jnp.maximum(data.high, high),
+    )
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put(rows: Array, new: Array, begin: Array) -> Array:
+    return jax.lax.dynamic_update_slice(rows, new, (begin, 0))
+
+
+def _range(labels: Labels) -> tuple[Array, Array]:
+    """Return the least and greatest codes [L] that Psi may give, from those of the labels."""
     low, high = labels.target.min(axis=0), labels.target.max(axis=0)
     margin = WIDER * (high - low)
-    numbers = (jnp.asarray(x, jnp.float32) for x in (middle, spread, size))
-    return ForceScales(*numbers, whitening, jnp.asarray(low - margin), jnp.asarray(high + margin))
+    return low - margin, high + margin
 
 
 def examples(labels: Labels, scales: ForceScales) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +131,7 @@ def examples(labels: Labels, scales: ForceScales) -> tuple[np.ndarray, np.ndarra
 
 def _changes(labels: Labels, whitening: Whitening) -> np.ndarray:
     """Return the changes [n, L] sqrt(J) of the whitened code that the labels ask for."""
-    return (labels.target - labels.code) @ np.asarray(whitening.to)
+    return np.asarray(labels.target - labels.code) @ np.asarray(whitening.to)
 
 
 def _inputs(labels: Labels, whitening: Whitening) -> np.ndarray:
@@ -103,35 +146,42 @@ def weight(targets: Array) -> Array:
 
 
 def optimizer(config: Config) -> optax.GradientTransformation:
-    """Build AdamW, whose rate falls to zero along a cosine in every round."""
+    """Build AdamW, whose rate stays and then falls to zero along a line, over the last `SETTLING` of all rounds."""
     settings = config.labels
+    steps = settings.rounds * settings.steps
 
     def rate(step):
-        return settings.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * (step % settings.steps) / settings.steps))
+        return settings.learning_rate * jnp.clip((1.0 - step / steps) / SETTLING, 0.0, 1.0)
 
     return optax.adamw(rate, weight_decay=settings.decay)
 
 
 def make_update(
-    labels: Labels, scales: ForceScales, config: Config, steps: int, device_mesh: Mesh | None = None
-) -> Callable[[TrainingState], tuple[TrainingState, dict[str, Array]]]:
-    """Return a jitted function that takes `steps` training steps, and their metrics [steps].
+    latent: int, config: Config, steps: int, device_mesh: Mesh | None = None
+) -> Callable[[Data, TrainingState], tuple[TrainingState, dict[str, Array]]]:
+    """Return a jitted function that takes `steps` training steps on data; it returns their metrics [steps] too.
 
-    The loss is the squared error of the whitened change, relative to its size. The function consumes its argument.
+    The loss is the squared error of the whitened change, relative to its size. The function consumes the state.
+
+    Args:
+        latent: L.
     """
     settings, transform = config.labels, optimizer(config)
-    network = ForcePsi(config.stage2, labels.code.shape[1])
-    data = tuple(jnp.asarray(part) for part in examples(labels, scales))
+    network = ForcePsi(config.stage2, latent)
 
-    def loss(params, data, key):
-        rows = jax.random.randint(key, (settings.batch,), 0, len(data[0]))
-        inputs, targets = (part[rows] for part in data)
-        errors = jnp.mean((mlp.apply(network, params, inputs) - targets) ** 2, axis=-1)
-        return jnp.mean(weight(targets) * errors)
-
-    def train_step(data, state: TrainingState):
+    def train_step(data: Data, state: TrainingState):
         key = jax.random.fold_in(state.key, state.step)
-        value, gradient = jax.value_and_grad(loss)(state.params, data, key)
-        return loop.apply_gradient(transform, state, value, gradient, ema=0.99)
+        rows = jax.random.randint(key, (settings.batch,), 0, data.count)
+        inputs, targets = data.inputs[rows], data.targets[rows]
 
-    return loop.scan_steps(train_step, data, steps, device_mesh)
+        def loss(params):
+            errors = jnp.mean((mlp.apply(network, params, inputs) - targets) ** 2, axis=-1)
+            return jnp.mean(weight(targets) * errors)
+
+        value, gradient = jax.value_and_grad(loss)(state.params)
+        scales = state.normalizers
+        scales = scales._replace(low=jnp.minimum(scales.low, data.low), high=jnp.maximum(scales.high, data.high))
+        state = state._replace(normalizers=scales)
+        return loop.apply_gradient(transform, state, value, gradient, ema=0.997)
+
+    return loop.scan_steps(train_step, steps, device_mesh)

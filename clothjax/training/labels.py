@@ -1,4 +1,4 @@
-"""Labelled frames: where the descent would take states of Psi's own rollouts (DAgger, Ross et al. 2011)."""
+"""Labelled frames: where the descent takes the states of simulations that Psi moves (DAgger, Ross et al. 2011)."""
 
 import json
 import zlib
@@ -18,14 +18,17 @@ from clothjax.files import damage
 from clothjax.networks import forces, phi, psi
 from clothjax.networks.normalisation import ForceScales
 from clothjax.physics import descent, incremental_potential
+from clothjax.physics.energies import GRAVITY
 from clothjax.simulation import characters, rollout, time_step
 from clothjax.simulation.scene import Scene
 from clothjax.training import pool, sampling
+from clothjax.training.pool import Simulation
 from clothjax.types import Array, ClothState, Pose
 
 NOISY = 0.2  # share of the frames whose code gets noise
 WILD = (2.0, 0.2)  # a code of Psi's with more energy than so often the held one's, plus so many J, is not followed
 LOST = 200.0  # J, from which on a frame is left out
+PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
 
 
 class Labels(NamedTuple):
@@ -45,29 +48,45 @@ class Labels(NamedTuple):
         return float(np.median((self.predicted - self.least) / np.maximum(self.held - self.least, 1e-6)))
 
 
-class _Policy(NamedTuple):
-    """Psi as labelling needs it."""
+class Round(NamedTuple):
+    """What a round of labelling leaves."""
+
+    simulations: Simulation  # leaves [N, ...], where the next round goes on
+    labels: Labels
+
+
+class Policy(NamedTuple):
+    """The Psi that moves the garment while it is labelled, and the teacher's preconditioner."""
 
     params: dict
     scales: ForceScales
-    garment: dict
-    inverse_hessian: Array
+    garment: dict  # parameters of the decoder
+    inverse_hessian: Array  # [L, L] in 1/J
 
 
-def make_sequence(scene: Scene, config: Config) -> Callable:
-    """Return a function that rolls out and labels a sequence of frames of a random clip, body and material.
+def begin(scene: Scene, clips: Clips, config: Config) -> Simulation:
+    """Return the simulations of the first round, leaves [N, ...]."""
+    keys = sampling.keys(config.labels.seed, config.labels.simulations)
+    clips = jax.tree.map(jnp.asarray, clips)
+    return jax.device_get(jax.jit(jax.vmap(lambda key: pool.begin(key, scene, clips, config)))(keys))
 
-    Its arguments are a random key, a `_Policy` and clips; it returns `Labels` of T frames.
+
+def make_segment(scene: Scene, config: Config) -> Callable:
+    """Return a function that moves a simulation on by some frames and labels them.
+
+    Its arguments are a random key with a `Simulation`, a `Policy` and clips; it returns a `Round` of T frames.
     """
     settings = config.labels
 
-    def sequence(key: Array, policy: _Policy, clips: Clips) -> Labels:
-        begin_key, share_key, noise_key = jax.random.split(key, 3)
-        simulation = pool.begin(begin_key, scene, clips, config)
+    def segment(one: tuple[Array, Simulation], policy: Policy, clips: Clips) -> Round:
+        key, simulation = one
+        share_key, noise_key, external_key, new_key, renew_key = jax.random.split(key, 5)
         character = pool.dressed(scene, simulation.betas, simulation.material, config)
         constants = psi.constant_inputs(character.betas, character.material, config.material)
-        share = jax.random.choice(share_key, jnp.array(settings.shares))
-        whitening = policy.scales.whitening
+        scales = policy.scales
+        # a Psi that has learnt nothing yet holds the code: it does not move the garment
+        share = jnp.where(scales.output > 0, jax.random.choice(share_key, jnp.array(settings.shares)), 0.0)
+        external = draw_external(external_key, settings.external)
 
         def precondition(gradient: Array) -> Array:
             return jnp.matmul(policy.inverse_hessian, gradient, precision="highest")
@@ -75,7 +94,7 @@ def make_sequence(scene: Scene, config: Config) -> Callable:
         def frame(state: ClothState, inputs: tuple[Pose, Array]) -> tuple[ClothState, Labels]:
             poses, key = inputs
             window = characters.window(scene, character, poses)
-            step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config)
+            step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config, external)
             held = state.latent
 
             def garment(code: Array) -> Array:
@@ -85,14 +104,13 @@ def make_sequence(scene: Scene, config: Config) -> Callable:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
             pulls = forces.reduced(garment, held, step, scene.mesh, config.physics)
-            scales = policy.scales
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code])
             energies = jax.lax.map(lambda z: potential(garment(z)), starts)
-            begin = starts[jnp.argmin(jnp.where(jnp.isnan(energies), jnp.inf, energies))]
+            start = starts[jnp.argmin(jnp.where(jnp.isnan(energies), jnp.inf, energies))]
             target, _ = descent.converge(
-                precondition, begin, garment, potential, settings.descent_steps, phi.DESCENT_BOUND, settings.tolerance
+                precondition, start, garment, potential, settings.descent_steps, phi.DESCENT_BOUND, settings.tolerance
             )
             labels = Labels(
                 held, state.change, pulls, constants, target, energies[0], energies[2], potential(garment(target))
@@ -102,53 +120,70 @@ def make_sequence(scene: Scene, config: Config) -> Callable:
             keys = jax.random.split(key, 3)
             length = settings.noise * jax.random.uniform(keys[0]) / np.sqrt(len(held), dtype=np.float32)
             length = jnp.where(jax.random.uniform(keys[1]) < NOISY, length, 0.0)
-            taken += jnp.matmul(length * jax.random.normal(keys[2], held.shape), whitening.back, precision="highest")
+            noise = length * jax.random.normal(keys[2], held.shape)
+            taken += jnp.matmul(noise, scales.whitening.back, precision="highest")
             new = garment(taken)
             velocity = new - state.position
             state = ClothState(new, velocity, velocity - state.velocity, taken, taken - held)
             return rollout.follow(state, poses.translation[2]), labels
 
         poses = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
-        return jax.lax.scan(frame, simulation.cloth, (poses, jax.random.split(noise_key, settings.frames)))[1]
+        keys = jax.random.split(noise_key, settings.frames)
+        cloth, labels = jax.lax.scan(frame, simulation.cloth, (poses, keys))
+        goes_on = (
+            jnp.all(usable(labels))
+            & (clips.remaining[simulation.frame] > 2 * settings.frames)
+            & (jax.random.uniform(renew_key) > settings.renewed)
+        )
+        later = simulation._replace(cloth=cloth, frame=simulation.frame + settings.frames)
+        new = pool.begin(new_key, scene, clips, config)
+        return Round(jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), later, new), labels)
 
-    return sequence
+    return segment
 
 
-def collect(
-    params: dict,
-    scales: ForceScales,
-    garment: dict,
-    inverse_hessian: Array,
-    scene: Scene,
-    clips: Clips,
-    config: Config,
-    seed: int,
-    progress: Callable[[int], None] = lambda _: None,
-    device_mesh: Mesh | None = None,
-) -> Labels:
-    """Label the frames of a round's rollouts; those in which the cloth is lost are left out.
+def draw_external(key: Array, most: float) -> Array:
+    """Draw an external acceleration [3] m/s^2: mostly none, else weightlessness, or any direction up to `most`."""
+    kind_key, direction_key, length_key = jax.random.split(key, 3)
+    direction = jax.random.normal(direction_key, (3,))
+    wind = most * jax.random.uniform(length_key) * direction / jnp.linalg.norm(direction)
+    kind = jax.random.uniform(kind_key)
+    weightless = jnp.array([0.0, min(most, GRAVITY), 0.0])
+    return jnp.where(kind < PUSHED, jnp.where(kind < 0.2 * PUSHED, weightless, wind), 0.0)
+
+
+def usable(labels: Labels) -> Array:
+    """Return which of the labels [n] are finite, of cloth that is not lost."""
+    finite = [jnp.all(jnp.isfinite(part).reshape(len(part), -1), axis=1) for part in labels]
+    return jnp.all(jnp.stack(finite), axis=0) & (labels.least < LOST)
+
+
+def make_collect(
+    scene: Scene, clips: Clips, config: Config, device_mesh: Mesh | None = None
+) -> Callable[[Policy, Simulation, int, Callable[[int], None]], Round]:
+    """Return a function that labels a round of frames on the simulations of the last, compiled once.
+
+    Its arguments are a `Policy`, the simulations, the seed of the round, and a function to call with the number of
+    simulations done. The labels are flat, [n, ...]; usable frames again take the place of the others. It raises a
+    ValueError if none is usable.
 
     Args:
-        params, scales: of the Psi that moves the garment.
-        garment: parameters of the decoder.
-        inverse_hessian: [L, L] in 1/J, the preconditioner of the descent.
-        seed: of the round.
-        progress: called with the number of rollouts done.
-        device_mesh: each device takes a part of the rollouts.
-
-    Raises:
-        ValueError: if no frame is left.
+        device_mesh: each device takes a part of the simulations.
     """
-    policy = _Policy(params, scales, garment, inverse_hessian)
-    arguments = (policy, jax.tree.map(jnp.asarray, clips))
-    rounds = sampling.sample(
-        make_sequence(scene, config), arguments, config.labels.sequences, seed, progress, device_mesh, together=1
-    )
-    flat = Labels(*(part.reshape(-1, *part.shape[2:]) for part in rounds))
-    good = np.all([np.isfinite(part.reshape(len(part), -1)).all(axis=1) for part in flat], axis=0) & (flat.least < LOST)
-    if not good.any():
-        raise ValueError("no frame could be labelled: train stage 1 further before stage 2")
-    return Labels(*(part[good] for part in flat))
+    sample = sampling.make_sampler(make_segment(scene, config), device_mesh, together=1)
+    clips = jax.tree.map(jnp.asarray, clips)
+
+    def collect(policy: Policy, simulations: Simulation, seed: int, progress: Callable[[int], None]) -> Round:
+        keys = sampling.keys(seed, len(simulations.frame))
+        simulations, labels = sample((keys, simulations), (policy, clips), progress)
+        flat = Labels(*(part.reshape(-1, *part.shape[2:]) for part in labels))
+        (good,) = np.nonzero(np.asarray(usable(flat)))
+        if len(good) == 0:
+            raise ValueError("no frame could be labelled: train stage 1 further before stage 2")
+        rows = good[np.arange(len(flat.code)) % len(good)]
+        return Round(simulations, Labels(*(part[rows] for part in flat)))
+
+    return collect
 
 
 def fingerprint(settings: dict, params: dict) -> int:
@@ -162,28 +197,31 @@ def fingerprint(settings: dict, params: dict) -> int:
     return zlib.crc32(b"".join([json.dumps(settings).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)]))
 
 
-def save(labels: Labels, path: Path, of: int) -> None:
-    """Write labels to a file with their `fingerprint`, whole or not at all."""
+def save(finished: Round, path: Path, of: int) -> None:
+    """Write a round to a file with its `fingerprint`, whole or not at all."""
     partial = path.with_name(f".{path.name}")
+    leaves = {f"simulations_{i}": leaf for i, leaf in enumerate(jax.tree.leaves(finished.simulations))}
     with partial.open("wb") as file:
-        np.savez(file, **labels._asdict(), of=of)
+        np.savez(file, **finished.labels._asdict(), **leaves, of=of)
     partial.replace(path)
 
 
-def load(paths: list[Path], of: int) -> Labels:
-    """Read the labels of several files as one.
+def load(path: Path, of: int, like: Simulation) -> Round:
+    """Read a round from its file.
+
+    Args:
+        like: simulations, of which the structure is used.
 
     Raises:
         ValueError: for a file that is missing, damaged or of another `fingerprint`.
     """
-    parts = []
-    for path in paths:
-        try:
-            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                same = int(file["of"]) == of
-                parts.append(Labels(*(file[name] for name in Labels._fields)))
-        except damage.UNREADABLE as error:
-            raise ValueError(f"{path}: not readable labels ({error}); remove {path.parent} to begin anew") from error
-        if not same:
-            raise ValueError(f"{path}: of other settings or of another Phi; remove {path.parent} to begin anew")
-    return Labels(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            same = int(file["of"]) == of
+            labels = Labels(*(file[name] for name in Labels._fields))
+            leaves = [file[f"simulations_{i}"] for i in range(len(jax.tree.leaves(like)))]
+    except damage.UNREADABLE as error:
+        raise ValueError(f"{path}: not readable labels ({error}); remove {path.parent} to begin anew") from error
+    if not same:
+        raise ValueError(f"{path}: of other settings or of another Phi; remove {path.parent} to begin anew")
+    return Round(jax.tree.unflatten(jax.tree.structure(like), leaves), labels)

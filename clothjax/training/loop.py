@@ -156,21 +156,21 @@ def apply_gradient(
 
 
 def scan_steps(
-    train_step: Callable[[Data, State], tuple[State, Metrics]], data: Data, steps: int, device_mesh: Mesh | None
-) -> Callable[[State], tuple[State, Metrics]]:
-    """Return a jitted function that takes `steps` training steps, and their metrics [steps]; it donates its argument.
+    train_step: Callable[[Data, State], tuple[State, Metrics]], steps: int, device_mesh: Mesh | None
+) -> Callable[[Data, State], tuple[State, Metrics]]:
+    """Return a jitted function of data and a state: it takes `steps` training steps, and donates the state.
+
+    It returns the state after them, and their metrics [steps]. The data is the same on every device.
 
     Args:
         train_step: from the data and a state to the next state and its metrics.
-        data: copied to every device.
     """
 
-    @partial(jax.jit, donate_argnums=0, out_shardings=devices.replicated(device_mesh))
-    def update(state, data):
+    @partial(jax.jit, donate_argnums=1, out_shardings=devices.replicated(device_mesh))
+    def update(data, state):
         return jax.lax.scan(lambda state, _: train_step(data, state), state, None, length=steps)
 
-    data = devices.replicate(data, device_mesh)
-    return lambda state: update(state, data)
+    return update
 
 
 def _calls(update: Callable, state: Any, steps: int, steps_per_call: int, max_nonfinite: int) -> Iterator[Call]:

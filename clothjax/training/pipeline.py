@@ -6,10 +6,12 @@ it. Any other stage starts anew. The first checkpoint of stage 1 contains the bl
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -186,40 +188,46 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     experiment, config = run.experiment, run.config
     scene, settings, folder = experiment.scene, config.labels, run.directory / "stage2"
     params = jax.device_get(phi.state.average)
-    whitening = forces.whitening(params["inverse_hessian"])
+    garment, inverse = params["garment"], params["inverse_hessian"]
+    whitening = forces.whitening(inverse)
     betas = np.zeros(scene.body.shapedirs.shape[-1], np.float32)
     constants = constant_inputs(betas, configured_material(config), config.material)
-    state = imitation.blank(params["garment"], whitening, len(constants), config)
     done = max(run.steps("stage2"), default=0)
-    files = [folder / f"labels_{number:02}.npz" for number in range(settings.rounds)]
     progress.say(f"stage 2: the latent predictor with forces, {settings.rounds} rounds of {settings.steps} steps")
-    description = f"stage 2, {config.garment}"
     if run.steps("tuning") and done < settings.rounds * settings.steps:
         raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
     settings_read = {
         name: value for name, value in configuration.to_dict(config).items() if name not in MAY_DIFFER["stage2"]
     }
     of = labels.fingerprint(settings_read, params)
-    fitted, clock = None, {}
-    for number in range(max(done - 1, 0) // settings.steps, settings.rounds):  # from the newest checkpoint's round on
-        if done <= number * settings.steps and not files[number].is_file():
-            last = state if fitted is None else fitted.state
+    collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
+    update = imitation.make_update(len(inverse), config, STEPS_PER_CALL, run.device_mesh)
+    state = imitation.blank(garment, whitening, len(constants), config)
+    fitted, data, scales, clock = loop.Fitted(state, 0.0, 0.0), None, state.normalizers, {}
+    simulations = labels.begin(scene, run.clips, config)
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(settings.rounds):
+        path, end = folder / f"labels_{number:03}.npz", (number + 1) * settings.steps
+        if path.is_file() or done >= end:
+            finished = labels.load(path, of, simulations)
+        else:
             began = time.monotonic()
-            with progress_bar(f"labelling, round {number + 1}", settings.sequences) as report:
-                new = labels.collect(
-                    last.average, last.normalizers, params["garment"], params["inverse_hessian"], scene, run.clips,
-                    config, settings.seed + number, report, run.device_mesh,
-                )  # fmt: skip
-            folder.mkdir(parents=True, exist_ok=True)
-            labels.save(new, files[number], of)
+            psi = labels.Policy(fitted.state.average, fitted.state.normalizers, garment, inverse)
+            with progress_bar(f"labelling, round {number + 1} of {settings.rounds}", settings.simulations) as report:
+                finished = collect(psi, simulations, settings.seed + number, report)
+            labels.save(finished, path, of)
             clock = _add_seconds(run, teacher_seconds=time.monotonic() - began)
-            progress.say(f"{len(new.code)} frames; median hold gap of Psi in its own rollouts: {new.gap():.3f}")
-        scales = imitation.measure(labels.load(files[:1], of), whitening)
-        known = labels.load(files[: number + 1], of)
-        begin = imitation.first(state, known, config) if number == 0 else state
-        update = imitation.make_update(known, scales, config, STEPS_PER_CALL, run.device_mesh)
-        fitted = _fit(run, "stage2", update, begin, (number + 1) * settings.steps, description)
-    assert fitted is not None
+        simulations = finished.simulations
+        if data is None:
+            state = imitation.first(state, finished.labels, config)
+            scales = jax.tree.map(jnp.array, state.normalizers)  # training consumes the state
+            data = imitation.room(finished.labels, scales, config)
+        data = imitation.extended(data, finished.labels, scales)
+        if done <= end:
+            progress.say(f"{int(data.count)} frames; hold gap of the newest, median: {finished.labels.gap():.3f}")
+            now = partial(update, devices.replicate(data, run.device_mesh))
+            fitted = _fit(run, "stage2", now, state, end, f"stage 2, {config.garment}")
+            state = fitted.state
     return fitted, clock
 
 

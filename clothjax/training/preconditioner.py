@@ -60,9 +60,8 @@ def measure(
         return descent.nearest_convex(descent.hessian(energy, latents[-1]))
 
     clips = jax.tree.map(jnp.asarray, clips)
-    hessians = sampling.sample(
-        sequence, (model, clips), config.model.descent_samples, config.stage1.seed, progress, device_mesh
-    )
+    keys = sampling.keys(config.stage1.seed, config.model.descent_samples)
+    hessians = sampling.make_sampler(sequence, device_mesh)(keys, (model, clips), progress)
     good = np.isfinite(hessians).all(axis=(1, 2))
     if not good.any():
         raise ValueError(

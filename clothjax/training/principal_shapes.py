@@ -107,7 +107,8 @@ def simulate(
         return jax.lax.scan(frame, state, poses)[1]
 
     arguments = (jax.tree.map(jnp.asarray, clips), jnp.asarray(inverse))
-    displacements = sampling.sample(sequence, arguments, settings.sequences, settings.seed, progress, device_mesh)
+    keys = sampling.keys(settings.seed, settings.sequences)
+    displacements = sampling.make_sampler(sequence, device_mesh)(keys, arguments, progress)
     good = np.abs(displacements).max(axis=(1, 2, 3)) < MAX_DISPLACEMENT
     if not good.any():
         raise ValueError(

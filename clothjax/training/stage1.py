@@ -246,7 +246,8 @@ def make_update(
         animator: makes what is trained, of its `params` and `statistics`.
     """
     problem = Problem(scene, config, frames, optimizer(config), animator, device_mesh)
-    return loop.scan_steps(partial(train_step, problem), clips, steps, device_mesh)
+    update = loop.scan_steps(partial(train_step, problem), steps, device_mesh)
+    return partial(update, devices.replicate(clips, device_mesh))
 
 
 def train_step(problem: Problem, clips: Clips, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:

@@ -105,7 +105,8 @@ def teach(
     stage = config.stage2
     began = time.monotonic()
     sequence = make_rollout(scene, input_joints, config)
-    teacher = sampling.sample(sequence, (model, clips), stage.sequences, stage.seed + 1, progress, device_mesh)
+    keys = sampling.keys(stage.seed + 1, stage.sequences)
+    teacher = sampling.make_sampler(sequence, device_mesh)(keys, (model, clips), progress)
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
         raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")
@@ -266,4 +267,4 @@ def make_update(
         value, gradient = jax.value_and_grad(loss)(state.params, state, teacher, key)
         return loop.apply_gradient(transform, state, value, gradient, ema=0.99)
 
-    return loop.scan_steps(train_step, teacher, steps, device_mesh)
+    return partial(loop.scan_steps(train_step, steps, device_mesh), devices.replicate(teacher, device_mesh))

@@ -14,10 +14,11 @@ from clothjax.config import LabelsConfig
 from clothjax.evaluation import report
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import descent, incremental_potential
+from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import models, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
-from clothjax.training import imitation, labels, pipeline, pool, stage1
-from clothjax.training.labels import Labels
+from clothjax.training import imitation, labels, pipeline, pool, sampling, stage1
+from clothjax.training.labels import Round
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def toy():
         config,
         motions=("walk_0", "dance_0"),
         stage2=dataclasses.replace(config.stage2, forces=True),
-        labels=LabelsConfig(rounds=2, sequences=2, frames=5, descent_steps=20, steps=20, batch=8),
+        labels=LabelsConfig(rounds=2, simulations=2, frames=5, external=0.0, steps=20, batch=8),
     )
     experiment = assembly.assemble(config)
     clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
@@ -86,17 +87,29 @@ def test_a_descent_that_converges_stops_sooner_where_the_start_is_better(problem
     assert float(potential(garment(near))) <= float(potential(garment(end))) * (1 + 1e-5)
 
 
-def collected(toy, state, seed=0) -> Labels:
+@pytest.fixture(scope="module")
+def collect(toy):
+    experiment, clips, *_ = toy
+    return labels.make_collect(experiment.scene, clips, experiment.config)
+
+
+def collected(toy, collect, state, simulations=None, seed=0) -> Round:
     experiment, clips, params, _ = toy
-    return labels.collect(
-        state.params, state.normalizers, params["garment"], params["inverse_hessian"],
-        experiment.scene, clips, experiment.config, seed,
-    )  # fmt: skip
+    if simulations is None:
+        simulations = labels.begin(experiment.scene, clips, experiment.config)
+    policy = labels.Policy(state.params, state.normalizers, params["garment"], params["inverse_hessian"])
+    return collect(policy, simulations, seed, lambda _: None)
 
 
 @pytest.fixture(scope="module")
-def round_of(toy):
-    return collected(toy, toy[3])
+def finished(toy, collect):
+    """A round of the blank Psi."""
+    return collected(toy, collect, toy[3])
+
+
+@pytest.fixture(scope="module")
+def round_of(finished):
+    return finished.labels
 
 
 def test_a_blank_psi_holds_the_code_and_labels_take_energy_from_it(round_of):
@@ -105,25 +118,78 @@ def test_a_blank_psi_holds_the_code_and_labels_take_energy_from_it(round_of):
     assert round_of.gap() == pytest.approx(1.0)
 
 
-def test_labels_survive_a_file(round_of, tmp_path):
-    for name in ("a.npz", "b.npz"):
-        labels.save(round_of, tmp_path / name, 7)
-    both = labels.load([tmp_path / "a.npz", tmp_path / "b.npz"], 7)
-    np.testing.assert_array_equal(both.forces[10:], round_of.forces)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
+def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finished):
+    first = labels.begin(toy[0].scene, toy[1], toy[0].config)
+    after = finished.simulations
+    on = after.frame == first.frame + 5
+    assert on.any()  # the others began anew
+    again = collected(toy, collect, toy[3], after, seed=1)
+    np.testing.assert_array_equal(again.labels.code[::5][on], after.cloth.latent[on])
 
 
-def test_labels_of_something_else_and_damaged_ones_are_refused(toy, round_of, tmp_path):
-    params = toy[2]
+def test_an_external_acceleration_moves_free_cloth_as_gravity_would(problem, toy):
+    """Without gravity's energy and with an external acceleration of -g, the potential differs by a constant."""
+    scene, config, garment, step, code = problem
+    clips = toy[1]
+    simulation = pool.begin(jax.random.key(3), scene, clips, config)
+    character = pool.dressed(scene, simulation.betas, simulation.material, config)
+    window = characters.window(scene, character, motion_clips.poses(clips, simulation.frame))
+    fall = jnp.array([0.0, -GRAVITY, 0.0])
+    arguments = (scene, character, simulation.cloth, window, jnp.float32(1 / config.fps))
+    falling = time_step.time_step(*arguments, config, fall)
+    others = ("stretching", "bending", "collision", "edge_collision", "friction")
+
+    def force(step, *without):
+        physics = dataclasses.replace(config.physics, without=(*others, *without))
+        return jax.grad(lambda z: incremental_potential.potential(garment(z), step, scene.mesh, physics))(code)
+
+    expected = force(step)
+    np.testing.assert_allclose(force(falling, "gravity"), expected, atol=1e-4 * float(jnp.abs(expected).max()))
+    assert np.abs(force(step, "gravity") - expected).max() > 0.01 * np.abs(expected).max()
+
+
+def test_external_accelerations_are_mostly_none_and_never_beyond_the_most():
+    drawn = np.asarray(jax.vmap(labels.draw_external, (0, None))(sampling.keys(0, 2000), 12.0))
+    length = np.linalg.norm(drawn, axis=1)
+    assert 0.8 < (length == 0).mean() < 0.9 and length.max() <= 12.0
+    assert (np.abs(drawn - [0, GRAVITY, 0]).max(axis=1) < 1e-5).sum() > 20
+
+
+def test_a_round_survives_a_file(finished, tmp_path):
+    labels.save(finished, tmp_path / "a.npz", 7)
+    assert_same(finished, labels.load(tmp_path / "a.npz", 7, finished.simulations))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_labels_of_something_else_and_damaged_ones_are_refused(toy, finished, tmp_path):
+    params, path = toy[2], tmp_path / "a.npz"
     of = labels.fingerprint({"a": 1}, params)
-    labels.save(round_of, tmp_path / "a.npz", of)
+    labels.save(finished, path, of)
     other = params | {"inverse_hessian": 2.0 * params["inverse_hessian"]}
     for settings, network in (({"a": 2}, params), ({"a": 1}, other)):
         with pytest.raises(ValueError, match=r"a\.npz: of other settings or of another Phi; remove"):
-            labels.load([tmp_path / "a.npz"], labels.fingerprint(settings, network))
-    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:1000])
+            labels.load(path, labels.fingerprint(settings, network), finished.simulations)
+    path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=r"a\.npz: not readable labels"):
-        labels.load([tmp_path / "a.npz"], of)
+        labels.load(path, of, finished.simulations)
+
+
+def test_frames_of_several_rounds_are_learnt_from_and_widen_the_range_of_codes(toy, round_of):
+    config = toy[0].config
+    state = imitation.first(toy[3], round_of, config)
+    other = round_of._replace(target=round_of.target + 1.0)
+    data = imitation.room(round_of, state.normalizers, config)
+    assert int(data.count) == 0
+    for labelled in (round_of, other):
+        data = imitation.extended(data, labelled, state.normalizers)
+    assert int(data.count) == 20 == len(data.inputs)
+    for rows, labelled in ((slice(0, 10), round_of), (slice(10, 20), other)):
+        expected = imitation.examples(labelled, state.normalizers)
+        np.testing.assert_allclose(data.inputs[rows], expected[0], atol=1e-6)
+        np.testing.assert_allclose(data.targets[rows], expected[1], rtol=1e-6)
+    low, high = state.normalizers.low, state.normalizers.high
+    np.testing.assert_allclose(data.low, low, atol=1e-5)
+    np.testing.assert_allclose(data.high, high + 1.0, atol=1e-4)
 
 
 def test_examples_say_where_the_labels_go(toy, round_of):
@@ -148,17 +214,16 @@ def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
     np.testing.assert_allclose(fitted, targets, atol=0.02)
 
 
-def test_the_animator_takes_the_step_of_the_labelled_psi(toy, round_of):
+def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of):
     """The code that a rollout stores is the one that labelling counts as Psi's."""
     experiment, clips, params, blank = toy
     state = imitation.first(blank, round_of, experiment.config)
-    new = collected(toy, state, 5)
+    new = collected(toy, collect, state, seed=5).labels
     assert (new.predicted != new.held).all()
     scene, config = experiment.scene, experiment.config
     make = animators.force_psi_animator(params["garment"], state.normalizers)
 
-    key, *_ = jax.random.split(jax.random.split(jax.random.key(5), 2)[0], 3)
-    simulation = pool.begin(key, scene, clips, config)
+    simulation = pool.begin(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
     character = pool.dressed(scene, simulation.betas, simulation.material, config)
     poses = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
 
@@ -180,19 +245,24 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
 
     stopped = whole._replace(directory=tmp_path / "stopped")
     first = pipeline.train_phi(stopped)
-    collect = labels.collect
+    make_collect = labels.make_collect
 
-    def once(*arguments):
-        if arguments[7] > 0:
-            raise KeyboardInterrupt
-        return collect(*arguments)
+    def stopping(*arguments):
+        collect = make_collect(*arguments)
 
-    monkeypatch.setattr(labels, "collect", once)
+        def once(policy, simulations, seed, report):
+            if seed > 0:
+                raise KeyboardInterrupt
+            return collect(policy, simulations, seed, report)
+
+        return once
+
+    monkeypatch.setattr(labels, "make_collect", stopping)
     with pytest.raises(KeyboardInterrupt):
         pipeline.train_force_psi(stopped, first)
-    monkeypatch.setattr(labels, "collect", collect)
+    monkeypatch.setattr(labels, "make_collect", make_collect)
     resumed, _ = pipeline.train_force_psi(stopped, first)
-    monkeypatch.setattr(labels, "collect", once)  # a finished one is read
+    monkeypatch.setattr(labels, "make_collect", stopping)  # a finished one is read
     assert_same(resumed.state.params, pipeline.train_force_psi(stopped, first)[0].state.params)
     assert_same(straight.state.params, resumed.state.params)
     assert_same(straight.state.normalizers, resumed.state.normalizers)
