@@ -40,6 +40,17 @@ def test_the_documents_have_blocks_and_name_what_is_there():
             assert all((ROOT / word).is_file() for word in rest if word.startswith("configs/")), command
 
 
+def test_the_table_of_the_package_names_every_module():
+    rows = re.findall(r"(?m)^\| `(\w+)/` \|.*\| (.*) \|$", (ROOT / "clothjax" / "README.md").read_text())
+    assert len(rows) > 8
+    for folder, names in rows:
+        there = {path.name for path in (ROOT / "clothjax" / folder).iterdir()}
+        named = set(re.findall(r"`([\w.]+)`", names))
+        modules = {name.removesuffix(".py") for name in there if name.endswith(".py")} - {"__init__"}
+        assert modules == {name for name in named if "." not in name}, folder
+        assert {name for name in named if "." in name} <= there, folder
+
+
 def test_documents_are_in_short_sentences():
     found = [path for path in ROOT.rglob("*.md") if not {".venv", ".venv-ci", "node_modules"} & set(path.parts)]
     assert len(found) > 20 and len((ROOT / "README.md").read_text().splitlines()) <= 130
