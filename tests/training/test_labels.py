@@ -58,6 +58,8 @@ def test_forces_are_minus_the_gradient_of_the_potential(problem):
     gradient = jax.grad(lambda z: incremental_potential.potential(garment(z), step, scene.mesh, config.physics))(code)
     np.testing.assert_allclose(kinds.sum(0), -gradient, atol=1e-4 * float(jnp.abs(gradient).max()))
     assert (np.abs(kinds).max(axis=1) > 0).all()  # each kind is there
+    terms = {*incremental_potential.energies(garment(code), step, scene.mesh, config.physics), "self_collision"}
+    assert sorted(name for names in forces.KINDS.values() for name in names) == sorted(terms)  # each once
 
 
 def test_whitening_makes_the_mean_hessian_the_identity():
