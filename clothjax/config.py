@@ -351,6 +351,9 @@ class LabelsConfig:
     """Simulations that are labelled in a round, each of its own clip, betas and material. They go on in the next."""
     frames: int = 30
     """Frames by which a round moves a simulation."""
+    candidates: int = 16
+    """Faces of the body whose planes a vertex can feel: those that it is near to most often in rollouts of Phi."""
+    candidate_rollouts: int = 96
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
     descent_steps: int = 20

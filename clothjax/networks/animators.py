@@ -161,7 +161,9 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
                 return phi.decode(garment, scene, character, code, inputs.window, config.model)
 
             held, change = jax.lax.stop_gradient((inputs.state.latent, inputs.state.change))
-            pulls = jax.lax.stop_gradient(forces.reduced(decode, held, inputs.time_step, scene.mesh, config.physics))
+            pulls = jax.lax.stop_gradient(
+                forces.reduced(decode, held, inputs.time_step, inputs.window, scene, scales.candidates, config.physics)
+            )
             code = next_code(model["params"], scales, held, change, pulls, constants, config.stage2)
             code += jax.lax.stop_gradient(jnp.clip(code, scales.low, scales.high) - code)
             return StepOutput(decode(code), code)

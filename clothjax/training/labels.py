@@ -103,7 +103,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             def potential(new: Array) -> Array:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
-            pulls = forces.reduced(garment, held, step, scene.mesh, config.physics)
+            pulls = forces.reduced(garment, held, step, window, scene, scales.candidates, config.physics)
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code])

@@ -27,6 +27,7 @@ from clothjax.progress import progress_bar
 from clothjax.simulation import assembly
 from clothjax.simulation.assembly import Experiment
 from clothjax.training import (
+    candidates,
     devices,
     fine_tuning,
     imitation,
@@ -202,7 +203,7 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     of = labels.fingerprint(settings_read, params)
     collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
     update = imitation.make_update(len(inverse), config, STEPS_PER_CALL, run.device_mesh)
-    state = imitation.blank(garment, whitening, len(constants), config)
+    state = imitation.blank(garment, whitening, _candidates(run, phi, of), len(constants), config)
     fitted, data, scales, clock = loop.Fitted(state, 0.0, 0.0), None, state.normalizers, {}
     simulations = labels.begin(scene, run.clips, config)
     folder.mkdir(parents=True, exist_ok=True)
@@ -229,6 +230,22 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
             fitted = _fit(run, "stage2", now, state, end, f"stage 2, {config.garment}")
             state = fitted.state
     return fitted, clock
+
+
+def _candidates(run: Run, phi: loop.Fitted, of: int) -> np.ndarray:
+    """Return the candidates [V, K] of stage 2 with forces, from the run's folder if they are there."""
+    path = run.directory / "stage2" / f"candidates_{of}.npy"
+    if path.is_file():
+        return np.load(path, allow_pickle=False)
+    model = {"params": phi.state.average, "statistics": phi.state.statistics}
+    with progress_bar("looking for what the cloth touches", run.config.labels.candidate_rollouts) as report:
+        found = candidates.measure(model, run.experiment.scene, run.clips, run.config, report, run.device_mesh)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial_path = path.with_name(f".{path.name}")
+    with partial_path.open("wb") as file:
+        np.save(file, found)
+    partial_path.replace(path)
+    return found
 
 
 def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:

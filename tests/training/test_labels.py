@@ -13,11 +13,11 @@ from clothjax.body import motion_clips
 from clothjax.config import LabelsConfig
 from clothjax.evaluation import report
 from clothjax.networks import animators, forces, phi
-from clothjax.physics import descent, incremental_potential
+from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import models, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
-from clothjax.training import imitation, labels, pipeline, pool, sampling, stage1
+from clothjax.training import candidates, imitation, labels, pipeline, pool, sampling, stage1
 from clothjax.training.labels import Round
 
 
@@ -29,18 +29,20 @@ def toy():
         config,
         motions=("walk_0", "dance_0"),
         stage2=dataclasses.replace(config.stage2, forces=True),
-        labels=LabelsConfig(rounds=2, simulations=2, frames=5, external=0.0, steps=20, batch=8),
+        labels=LabelsConfig(rounds=2, simulations=2, frames=5, candidate_rollouts=1, external=0.0, steps=20, batch=8),
     )
     experiment = assembly.assemble(config)
     clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
     params = stage1.init(experiment.scene, clips, config).params
     whitening = forces.whitening(params["inverse_hessian"])
-    return experiment, clips, params, imitation.blank(params["garment"], whitening, 14, config)
+    vertices = len(experiment.garment.vertices)
+    near = np.arange(vertices * 16, dtype=np.int32).reshape(vertices, 16) % len(experiment.scene.body.faces)
+    return experiment, clips, params, imitation.blank(params["garment"], whitening, near, 14, config)
 
 
 @pytest.fixture(scope="module")
 def problem(toy):
-    """A time step of a moving garment: from a code to vertices, the step, and a code that moves them."""
+    """A time step of a moving garment, the window around it, from a code to vertices, and a code that moves them."""
     experiment, clips, params, _ = toy
     scene, config = experiment.scene, experiment.config
     simulation = pool.begin(jax.random.key(3), scene, clips, config)
@@ -49,17 +51,43 @@ def problem(toy):
     step = time_step.time_step(scene, character, simulation.cloth, window, jnp.float32(1 / config.fps), config)
     garment = partial(phi.decode, params["garment"], scene, character, window=window, config=config.model)
     code = 0.3 * jax.random.normal(jax.random.key(4), simulation.cloth.latent.shape)
-    return scene, config, lambda z: garment(latent=z), step, code
+    return scene, config, lambda z: garment(latent=z), step, window, code
 
 
-def test_forces_are_minus_the_gradient_of_the_potential(problem):
-    scene, config, garment, step, code = problem
-    kinds = forces.reduced(garment, code, step, scene.mesh, config.physics)
-    gradient = jax.grad(lambda z: incremental_potential.potential(garment(z), step, scene.mesh, config.physics))(code)
+def all_faces(scene):
+    return np.broadcast_to(np.arange(len(scene.body.faces)), (len(scene.garment.vertices), len(scene.body.faces)))
+
+
+def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem):
+    """Of all terms but friction and contact of edges; with all faces as candidates, contact is HOOD's."""
+    scene, config, garment, step, window, code = problem
+    kinds = forces.reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)), config.physics)
+    body = window.following.body
+    planes = contact_search.find_at_centroids(garment(code), body, body, scene.body.faces)
+    physics = dataclasses.replace(config.physics, without=("friction", "edge_collision"))
+    seen = step._replace(contact=planes)
+    gradient = jax.grad(lambda z: incremental_potential.potential(garment(z), seen, scene.mesh, physics))(code)
     np.testing.assert_allclose(kinds.sum(0), -gradient, atol=1e-4 * float(jnp.abs(gradient).max()))
     assert (np.abs(kinds).max(axis=1) > 0).all()  # each kind is there
-    terms = {*incremental_potential.energies(garment(code), step, scene.mesh, config.physics), "self_collision"}
-    assert sorted(name for names in forces.KINDS.values() for name in names) == sorted(terms)  # each once
+    terms = set(incremental_potential.energies(garment(code), step, scene.mesh, config.physics))
+    felt = [name for names in forces.KINDS.values() for name in names]
+    assert sorted(felt) == sorted(terms - {"friction", "edge_collision"})  # each once
+
+
+def test_a_vertex_feels_only_its_candidates(problem):
+    scene, _, garment, step, window, code = problem
+    held, body, faces = garment(code), window.following.body, jnp.asarray(scene.body.faces)
+    far = jnp.argmax(jnp.linalg.norm(held[:, None] - contact_search.centroids(body, faces)[0][None], axis=-1), axis=1)
+    contact = forces.felt(step, held, body, faces, far[:, None].astype(jnp.int32)).contact
+    np.testing.assert_array_equal(contact.point_next, contact_search.centroids(body, faces)[0][far])
+
+
+def test_candidates_are_what_comes_near_most_often():
+    faces = np.array([[0, 5], [0, 5], [1, 6], [2, 7]])
+    distances = np.array([[0.2, 0.2], [0.2, 0.01], [0.01, 0.2], [0.01, 0.2]])
+    found = candidates.most_frequent(faces, distances, 8, 4)
+    # the first vertex is near to 1 and 2; to 0 twice, but far
+    np.testing.assert_array_equal(found, [[1, 2, 0, 1], [5, 6, 7, 5]])
 
 
 def test_whitening_makes_the_mean_hessian_the_identity():
@@ -71,7 +99,7 @@ def test_whitening_makes_the_mean_hessian_the_identity():
 
 
 def test_a_descent_that_converges_stops_sooner_where_the_start_is_better(problem):
-    scene, config, garment, step, code = problem
+    scene, config, garment, step, _, code = problem
 
     def potential(new):
         return incremental_potential.potential(new, step, scene.mesh, config.physics)
@@ -131,7 +159,7 @@ def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finish
 
 def test_an_external_acceleration_moves_free_cloth_as_gravity_would(problem, toy):
     """Without gravity's energy and with an external acceleration of -g, the potential differs by a constant."""
-    scene, config, garment, step, code = problem
+    scene, config, garment, step, _, code = problem
     clips = toy[1]
     simulation = pool.begin(jax.random.key(3), scene, clips, config)
     character = pool.dressed(scene, simulation.betas, simulation.material, config)
@@ -196,7 +224,7 @@ def test_frames_of_several_rounds_are_learnt_from_and_widen_the_range_of_codes(t
 
 def test_examples_say_where_the_labels_go(toy, round_of):
     whitening = toy[3].normalizers.whitening
-    scales = imitation.measure(round_of, whitening)
+    scales = imitation.measure(round_of, whitening, toy[3].normalizers.candidates)
     _, targets = imitation.examples(round_of, scales)
     reached = round_of.code + float(scales.output) * targets @ np.asarray(whitening.back)
     np.testing.assert_allclose(reached, round_of.target, atol=1e-3 * np.abs(round_of.target).max())
@@ -238,12 +266,16 @@ def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of)
     np.testing.assert_allclose(energy(), new.predicted[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(toy, tmp_path, monkeypatch):
     config = dataclasses.replace(toy[0].config, stage1=dataclasses.replace(toy[0].config.stage1, steps=20))
     whole = pipeline.prepare(config, tmp_path / "whole")
     first = pipeline.train_phi(whole)
     straight, _ = pipeline.train_force_psi(whole, first)
     assert int(straight.state.step) == 40
+    scene, near = whole.experiment.scene, straight.state.normalizers.candidates
+    centroids = np.asarray(scene.body.vertices)[scene.body.faces].mean(axis=1)
+    assert np.median(np.linalg.norm(centroids[near[:, 0]] - scene.garment.vertices, axis=-1)) < 0.1
 
     stopped = whole._replace(directory=tmp_path / "stopped")
     first = pipeline.train_phi(stopped)
