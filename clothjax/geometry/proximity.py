@@ -17,6 +17,12 @@ PASSES = 4  # rounds over all positions, before only those without an answer are
 CHUNK = 32  # positions searched together after that
 STRIDES = 2  # steps of a search along a surface
 LAST = jnp.iinfo(jnp.int32).max
+TILE = 256  # triangles tried together, where all are
+
+
+def _tries_all() -> bool:
+    """Return whether searches try everything: on a GPU, loops that end early make a batch wait for its slowest."""
+    return jax.default_backend() != "cpu"
 
 
 class Patches(NamedTuple):
@@ -89,17 +95,21 @@ def winding_number(positions: Array, corners: Array, groups: Array, asked: Array
     moment = jnp.sum(size * jnp.mean(corners, axis=1)[members].reshape(-1, PART, 3), axis=1)
     size, dipole = jnp.sum(size, axis=1), jnp.sum(area, axis=1)
     centre = moment / jnp.maximum(size, 1e-30)
-    rows, chunks = _chunks(asked)
 
-    def chunk(index, winding):
-        row = jax.lax.dynamic_slice(rows, (index * CHUNK,), (CHUNK,))
-        position = positions[jnp.minimum(row, len(positions) - 1)]
+    def around(position):
         # one coordinate after the other, so that it fuses
         offset = [centre[None, :, i] - position[:, None, i] for i in range(3)]
         along = sum(offset[i] * dipole[None, :, i] for i in range(3))
         squared = jnp.maximum(sum(x * x for x in offset) + SPREAD * size[None, :, 0], 1e-30)
-        total = jnp.sum(along / (squared * jnp.sqrt(squared)), axis=1) / (4.0 * jnp.pi)
-        return winding.at[row].set(total, mode="drop")
+        return jnp.sum(along / (squared * jnp.sqrt(squared)), axis=1) / (4.0 * jnp.pi)
+
+    if _tries_all():
+        return jnp.where(asked, around(positions), 0.0)
+    rows, chunks = _chunks(asked)
+
+    def chunk(index, winding):
+        row = jax.lax.dynamic_slice(rows, (index * CHUNK,), (CHUNK,))
+        return winding.at[row].set(around(positions[jnp.minimum(row, len(positions) - 1)]), mode="drop")
 
     return jax.lax.fori_loop(0, chunks, chunk, jnp.zeros(len(positions), positions.dtype))
 
@@ -236,6 +246,8 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
             gives the corners of its triangles.
     """
     positions, corners, groups = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, corners, groups)))
+    if _tries_all():
+        return _nearest_of_all(positions, corners, apart)
     count, last_group = positions.shape[0], groups.shape[0] - 1
     grouped = corners[groups]
     low, high = jnp.min(grouped, axis=(1, 2)), jnp.max(grouped, axis=(1, 2))
@@ -300,3 +312,24 @@ def nearest_face(positions: Array, corners: Array, groups: Array, apart: Array |
         return best.at[row].set(row_best, mode="drop"), face.at[row].set(row_face, mode="drop")
 
     return jax.lax.fori_loop(0, chunks, chunk, (best, face))[1]
+
+
+def _nearest_of_all(positions: Array, corners: Array, apart: Array | None) -> Array:
+    """Find the nearest triangles like `nearest_face`, by trying all of them, a tile at a time."""
+    number, last = jnp.arange(len(positions)), len(corners) - 1
+    tiles = jnp.minimum(jnp.arange(-(-len(corners) // TILE) * TILE), last).reshape(-1, TILE).astype(jnp.int32)
+
+    def tile(nearest: tuple[Array, Array], rows: Array) -> tuple[tuple[Array, Array], None]:
+        best, face = nearest
+        origin = corners[rows, 0]
+        b, c = ([(corners[rows, k] - origin)[None, :, i] for i in range(3)] for k in (1, 2))
+        _, _, squared = _closest(b, c, [positions[:, i, None] - origin[None, :, i] for i in range(3)])
+        if apart is not None:
+            own = jnp.any(jnp.asarray(apart)[rows][None] == number[:, None, None], axis=-1)
+            squared = jnp.where(own, jnp.inf, squared)
+        least, place = jnp.min(squared, axis=1), jnp.argmin(squared, axis=1)
+        better = least < best
+        return (jnp.where(better, least, best), jnp.where(better, rows[place], face)), None
+
+    first = (jnp.full(len(positions), jnp.inf, positions.dtype), jnp.zeros(len(positions), jnp.int32))
+    return jax.lax.scan(tile, first, tiles)[0][1]

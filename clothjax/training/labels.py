@@ -170,7 +170,7 @@ def make_collect(
     Args:
         device_mesh: each device takes a part of the simulations.
     """
-    sample = sampling.make_sampler(make_segment(scene, config), device_mesh, together=1)
+    sample = sampling.make_sampler(make_segment(scene, config), device_mesh, together=1, elsewhere=1024)
     clips = jax.tree.map(jnp.asarray, clips)
 
     def collect(policy: Policy, simulations: Simulation, seed: int, progress: Callable[[int], None]) -> Round:

@@ -16,7 +16,9 @@ from clothjax.types import Array
 ON_CPU, ELSEWHERE = 4, 64  # sequences in one program, by device
 
 
-def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, together: int = ON_CPU) -> Callable:
+def make_sampler(
+    sequence: Callable, device_mesh: Mesh | None = None, together: int = ON_CPU, elsewhere: int = ELSEWHERE
+) -> Callable:
     """Return a function that computes `sequence(one, *arguments)` for many, compiled once.
 
     Its arguments are `each`, the first arguments of the sequences with an axis [count], such as random keys; the other
@@ -27,6 +29,7 @@ def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, together: 
         sequence: a function that jax can transform; it returns a pytree of arrays.
         device_mesh: each device runs a part of them.
         together: sequences in one program on a CPU; 1 for those that take different numbers of steps.
+        elsewhere: sequences in one program on another device.
     """
     on_cpu = jax.default_backend() == "cpu"
     among = 1 if device_mesh is None else device_mesh.size
@@ -37,7 +40,7 @@ def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, together: 
 
     def sample(each: Any, arguments: tuple, progress: Callable[[int], None] = lambda _: None):
         count = len(jax.tree.leaves(each)[0])
-        size = among * min(together if on_cpu else ELSEWHERE, -(-count // among))
+        size = among * min(together if on_cpu else elsewhere, -(-count // among))
         arguments = devices.replicate(arguments, device_mesh)
 
         def part_from(start: int):

@@ -9,6 +9,15 @@ from samples import icosphere
 from clothjax.geometry import proximity
 
 
+@pytest.fixture(params=["on a CPU", "elsewhere"])
+def search(request, monkeypatch):
+    """The form of a search that a device gets."""
+    monkeypatch.setattr(proximity, "_tries_all", lambda: request.param == "elsewhere")
+    jax.clear_caches()  # the choice is made when a function is traced
+    yield
+    jax.clear_caches()
+
+
 def brute_force(positions, points):
     positions, points = positions.astype(np.float64), points.astype(np.float64)
     return np.linalg.norm(positions[:, None] - points[None], axis=-1)
@@ -25,6 +34,7 @@ def test_nearest_is_that_of_brute_force(origin):
     np.testing.assert_allclose(chosen**2, distances.min(axis=1) ** 2, atol=5e-7)
 
 
+@pytest.mark.usefixtures("search")
 @pytest.mark.parametrize("rounds, near", [(4, 0.1), (3, 0.2), (2, 0.5)])
 def test_winding_numbers_are_those_of_libigl(rounds, near):
     """Of a dented ball of few or many triangles, in places farther from it than a part of a patch is large."""
@@ -59,6 +69,7 @@ def test_winding_numbers_are_those_of_libigl(rounds, near):
     np.testing.assert_allclose(found, expected, atol=0.15)
 
 
+@pytest.mark.usefixtures("search")
 def test_what_fills_a_patch_up_does_not_wind():
     """Twenty triangles in a patch of 32: far from a closed mesh its dipoles cancel."""
     vertices, faces = icosphere(0)
@@ -95,6 +106,7 @@ def exact(positions, corners):
     return np.sqrt(squared)
 
 
+@pytest.mark.usefixtures("search")
 @pytest.mark.parametrize("faces", [20, 700])
 def test_the_nearest_face_is_that_of_brute_force_in_a_thousand_configurations(faces):
     """Two sizes: one where all groups are gone through at once, one where most must be skipped."""
@@ -111,6 +123,7 @@ def test_the_nearest_face_is_that_of_brute_force_in_a_thousand_configurations(fa
         np.testing.assert_allclose(chosen, exact(positions, corners), atol=2e-6)
 
 
+@pytest.mark.usefixtures("search")
 def test_a_triangle_is_never_the_answer_for_its_own_corners():
     random = np.random.default_rng(1)
     positions = random.normal(size=(120, 3)).astype(np.float32)
@@ -125,6 +138,7 @@ def test_a_triangle_is_never_the_answer_for_its_own_corners():
         np.testing.assert_allclose(chosen, exact(positions[vertex : vertex + 1], corners[others]), atol=2e-6)
 
 
+@pytest.mark.usefixtures("search")
 def test_no_position_finds_its_face_through_nan():
     """A position that is not finite gets some face, and its neighbours in the chunk their own."""
     random = np.random.default_rng(2)
