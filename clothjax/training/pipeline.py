@@ -34,6 +34,7 @@ from clothjax.training import (
     labels,
     laplacian_shapes,
     loop,
+    pool,
     preconditioner,
     principal_shapes,
     run_folder,
@@ -204,7 +205,7 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
     update = imitation.make_update(len(inverse), config, STEPS_PER_CALL, run.device_mesh)
     state = imitation.blank(garment, whitening, _candidates(run, phi, of), len(constants), config)
-    fitted, data, scales, clock = loop.Fitted(state, 0.0, 0.0), None, state.normalizers, {}
+    fitted, data, scales = loop.Fitted(state, 0.0, 0.0), None, state.normalizers
     simulations = labels.begin(scene, run.clips, config)
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(settings.rounds):
@@ -212,12 +213,9 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
         if path.is_file() or done >= end:
             finished = labels.load(path, of, simulations)
         else:
-            began = time.monotonic()
             psi = labels.Policy(fitted.state.average, fitted.state.normalizers, garment, inverse)
-            with progress_bar(f"labelling, round {number + 1} of {settings.rounds}", settings.simulations) as report:
-                finished = collect(psi, simulations, settings.seed + number, report)
+            finished = _label(run, collect, psi, simulations, number)
             labels.save(finished, path, of)
-            clock = _add_seconds(run, teacher_seconds=time.monotonic() - began)
         simulations = finished.simulations
         if data is None:
             state = imitation.first(state, finished.labels, config)
@@ -229,7 +227,16 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
             now = partial(update, devices.replicate(data, run.device_mesh))
             fitted = _fit(run, "stage2", now, state, end, f"stage 2, {config.garment}")
             state = fitted.state
-    return fitted, clock
+    return fitted, _add_seconds(run, teacher_seconds=0.0)
+
+
+def _label(run: Run, collect: Callable, psi: labels.Policy, simulations: pool.Simulation, number: int) -> labels.Round:
+    """Label a round of frames, and add the seconds that it takes to those of the run."""
+    settings, began = run.config.labels, time.monotonic()
+    with progress_bar(f"labelling, round {number + 1} of {settings.rounds}", settings.simulations) as report:
+        finished = collect(psi, simulations, settings.seed + number, report)
+    _add_seconds(run, teacher_seconds=time.monotonic() - began)
+    return finished
 
 
 def _candidates(run: Run, phi: loop.Fitted, of: int) -> np.ndarray:
