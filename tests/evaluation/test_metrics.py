@@ -120,6 +120,7 @@ def test_a_term_of_no_weight_is_not_computed():
     assert loss.weighted_loss(there, config, jnp.int32(1000)) == pytest.approx(6 + 5.0)
 
 
+@pytest.mark.slow
 def test_pinned_vertices_follow_skinning():
     config = dataclasses.replace(small(), garment="skirt_1000", motions=("walk_0",))
     experiment = assembly.assemble(config)

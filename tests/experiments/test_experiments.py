@@ -148,6 +148,7 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
         pipeline.train(trained.phi(run)[0], run)
 
 
+@pytest.mark.slow
 def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     trained.pack(finished, tmp_path / "packed")
     settings = ["--motions", "dance_3", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]

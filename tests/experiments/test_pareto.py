@@ -118,6 +118,7 @@ def test_what_was_trained_for_something_else_is_not_compared(run, monkeypatch):
         variants.prepare([Path("one"), Path("two")], (), 10)
 
 
+@pytest.mark.slow
 def test_the_quick_benchmark_of_a_shipped_garment(tmp_path):
     path = tmp_path / "pareto.json"
     report.main(["tshirt", "--part", "pareto", "--quick", "--json", str(path)])

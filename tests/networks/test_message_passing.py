@@ -61,6 +61,7 @@ def test_recomputed_blocks_give_the_same_nodes_and_gradients(monkeypatch, chunk)
         np.testing.assert_allclose(np.asarray(one), np.asarray(other), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_recomputed_blocks_take_less_memory():
     loss, inputs = problem()
     step = jax.jit(jax.grad(loss, has_aux=True), static_argnums=1)

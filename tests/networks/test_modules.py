@@ -82,6 +82,7 @@ def test_a_block_is_exchanged_for_another(toy):
     assert code.shape == (phi.apply(variables, seen)[0]).shape and np.isfinite(moved).all()
 
 
+@pytest.mark.slow
 def test_a_training_step_is_of_the_block_it_is_given():
     experiment = assembly.assemble(dataclasses.replace(small(), motions=("walk_0",)))
     reel = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])

@@ -131,6 +131,7 @@ def test_gradients_are_finite_on_the_surface_and_on_triangles_without_area():
         assert all(np.isfinite(g).all() for g in gradients)
 
 
+@pytest.mark.slow
 def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     config = Config()
     experiment = assembly.assemble(config)

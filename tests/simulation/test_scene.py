@@ -104,6 +104,7 @@ def test_the_energies_of_a_scene(experiment, pose, name, missing):
     } - missing  # fmt: skip
 
 
+@pytest.mark.slow
 def test_elements_among_pinned_vertices_are_left_out_and_not_missed(experiment, pose):
     pinned = scenes.build(experiment, "pinned_skirt")
     held = np.asarray(pinned.garment.pinned)

@@ -32,6 +32,7 @@ def update(toy):
     return stage1.make_update(experiment.scene, reel, experiment.config, 1, 1)
 
 
+@pytest.mark.slow
 def test_a_killed_and_resumed_training_ends_bit_for_bit_like_one_that_was_not(toy, update, tmp_path):
     experiment, reel = toy
     config = experiment.config
