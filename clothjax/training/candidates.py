@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from clothjax.body import motion_clips
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.geometry.proximity import nearest_point
@@ -30,9 +29,7 @@ def make_rollout(scene: Scene, config: Config) -> Callable:
     """
 
     def sequence(key: Array, model: dict, clips: Clips) -> tuple[Array, Array]:
-        simulation = pool.begin(key, scene, clips, config)
-        character = pool.dressed(scene, simulation.betas, simulation.material, config)
-        poses = motion_clips.there_and_back(clips, simulation.frame, FRAMES)
+        character, poses = pool.draw(key, scene, clips, config, FRAMES)
         animator = animators.phi_animator(model, scene, character, config)
         positions = rollout.play(animator, scene, character, poses, config).position
 

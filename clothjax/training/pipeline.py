@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 from clothjax import progress
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
-from clothjax.files import checkpoint, configuration
+from clothjax.files import checkpoint, configuration, damage
 from clothjax.material import configured_material
 from clothjax.networks import animators, forces
 from clothjax.networks.normalisation import ForceScales, Normalizers
@@ -243,15 +243,16 @@ def _candidates(run: Run, phi: loop.Fitted, of: int) -> np.ndarray:
     """Return the candidates [V, K] of stage 2 with forces, from the run's folder if they are there."""
     path = run.directory / "stage2" / f"candidates_{of}.npy"
     if path.is_file():
-        return np.load(path, allow_pickle=False)
+        try:
+            return np.load(path, allow_pickle=False)
+        except damage.UNREADABLE as error:
+            raise ValueError(f"{path}: not readable candidates ({error}); remove it to find them again") from error
     model = {"params": phi.state.average, "statistics": phi.state.statistics}
     with progress_bar("looking for what the cloth touches", run.config.labels.candidate_rollouts) as report:
         found = candidates.measure(model, run.experiment.scene, run.clips, run.config, report, run.device_mesh)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial_path = path.with_name(f".{path.name}")
-    with partial_path.open("wb") as file:
+    with run_folder.whole(path) as file:
         np.save(file, found)
-    partial_path.replace(path)
     return found
 
 

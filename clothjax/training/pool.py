@@ -13,7 +13,7 @@ from clothjax.networks import animators
 from clothjax.simulation import characters, time_step
 from clothjax.simulation.characters import Character
 from clothjax.simulation.scene import Scene
-from clothjax.types import Array, ClothState, Material
+from clothjax.types import Array, ClothState, Material, Pose
 
 
 class Simulation(NamedTuple):
@@ -50,3 +50,10 @@ def begin(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
     window = characters.window(scene, character, motion_clips.poses(clips, frame))
     cloth = time_step.start(character, window, animators.memory_size(scene, config))
     return Simulation(cloth, betas, material, frame, jnp.asarray(config.stage1.start_timestep > 0))
+
+
+def draw(key: Array, scene: Scene, clips: Clips, config: Config, frames: int) -> tuple[Character, Pose]:
+    """Return the character of a new simulation, and the windows of poses [frames, 3, ...] from its frame on."""
+    simulation = begin(key, scene, clips, config)
+    character = dressed(scene, simulation.betas, simulation.material, config)
+    return character, motion_clips.there_and_back(clips, simulation.frame, frames)

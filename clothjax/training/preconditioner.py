@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from clothjax.body import motion_clips
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.networks import animators, phi
@@ -43,9 +42,7 @@ def measure(
     """
 
     def sequence(key: Array, model: dict, clips: Clips) -> Array:
-        simulation = pool.begin(key, scene, clips, config)
-        character = pool.dressed(scene, simulation.betas, simulation.material, config)
-        poses = motion_clips.there_and_back(clips, simulation.frame, FRAMES)
+        character, poses = pool.draw(key, scene, clips, config, FRAMES)
         _, states, latents = rollout.play(
             animators.phi_animator(model, scene, character, config), scene, character, poses, config
         )

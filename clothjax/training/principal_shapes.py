@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from jax.sharding import Mesh
 
-from clothjax.body import motion_clips, skinning
+from clothjax.body import skinning
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.physics import descent
@@ -77,8 +77,7 @@ def simulate(
     inverse[np.ix_(network.free, network.free)] = np.linalg.inv(network.matrix.toarray())
 
     def sequence(key: Array, clips: Clips, inverse: Array) -> Array:
-        simulation = pool.begin(key, scene, clips, config)
-        character = pool.dressed(scene, simulation.betas, simulation.material, config)
+        character, poses = pool.draw(key, scene, clips, config, settings.frames)
 
         def precondition(gradient):
             return jnp.matmul(inverse, gradient.reshape(-1, 3), precision="highest").reshape(-1)
@@ -93,7 +92,6 @@ def simulate(
             new = descent.descend(precondition, now, garment, inputs.potential, settings.descent_steps, MAX_STEP)
             return StepOutput(garment(new), inputs.state.latent)
 
-        poses = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
         first = jax.tree.map(lambda x: x[0], poses)
         animator = Animator(0, step)
         state = rollout.settle(animator, scene, character, first, config)

@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 
 @contextlib.contextmanager
@@ -85,7 +86,14 @@ def add_seconds(directory: Path, **spent: float) -> dict[str, float]:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Write a file completely or not at all."""
+    with whole(path) as file:
+        file.write(text.encode())
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[BinaryIO]:
+    """Open a file to write bytes to; it gets its name when it is complete, or not at all."""
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
+    with partial.open("wb") as file:
+        yield file
     partial.replace(path)

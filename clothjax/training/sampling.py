@@ -1,4 +1,4 @@
-"""Batches of rollouts, each with its own key, or more of its own."""
+"""Batches of sequences that differ in their first argument, such as a random key."""
 
 import os
 from collections.abc import Callable

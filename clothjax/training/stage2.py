@@ -56,16 +56,14 @@ def make_rollout(scene: Scene, input_joints: np.ndarray, config: Config) -> Call
     stage = config.stage2
 
     def sequence(key: Array, model: dict, clips: Clips) -> Teacher:
-        simulation = pool.begin(key, scene, clips, config)
-        character = pool.dressed(scene, simulation.betas, simulation.material, config)
-        poses = motion_clips.there_and_back(clips, simulation.frame, stage.frames)
+        character, poses = pool.draw(key, scene, clips, config, stage.frames)
         animator = animators.phi_animator(model, scene, character, config)
         latents = rollout.play(animator, scene, character, poses, config).codes
 
         def inputs(poses: Pose):
             return psi.window_inputs(poses, character.joints, scene.body.parents, input_joints, config.fps)
 
-        constants = psi.constant_inputs(simulation.betas, simulation.material, config.material)
+        constants = psi.constant_inputs(character.betas, character.material, config.material)
         first = jnp.zeros_like(latents[:1])
         return Teacher(jnp.concatenate([first, latents]), jax.vmap(inputs)(poses), constants)
 
