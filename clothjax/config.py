@@ -354,6 +354,7 @@ class LabelsConfig:
     candidates: int = 16
     """Faces of the body whose planes a vertex can feel: those that it is near to most often in rollouts of Phi."""
     candidate_rollouts: int = 96
+    """Rollouts of Phi in which they are counted."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
     descent_steps: int = 20
@@ -377,7 +378,8 @@ class LabelsConfig:
     seed: int = 0
 
     def __post_init__(self):
-        _require(self.rounds >= 1, f"labels.rounds must be >= 1, got {self.rounds}")
+        for name in ("rounds", "simulations", "frames", "candidates", "candidate_rollouts"):
+            _require(getattr(self, name) >= 1, f"labels.{name} must be >= 1, got {getattr(self, name)}")
         _require(all(0 <= share <= 1 for share in self.shares), f"labels.shares must be in [0, 1]: {self.shares}")
 
 

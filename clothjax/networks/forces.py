@@ -19,8 +19,8 @@ KINDS = {
     "elasticity": ("stretching", "bending"),
     "contact": ("collision",),
 }
-"""Terms of the incremental potential that make up each kind of force. Friction and contact of edges, which need a
-search, are not felt."""
+"""Terms of the incremental potential that make up each kind of force. Friction, and contact of edges
+and of cloth with itself, are not felt."""
 SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its largest
 
 
@@ -35,7 +35,7 @@ def whitening(inverse_hessian: Array) -> Whitening:
 
 
 def felt(step: TimeStep, held: Array, body: Array, faces: Array, candidates: Array) -> TimeStep:
-    """Return a time step as Psi feels it: contact from fixed candidates, no search, no edges, no friction.
+    """Return a time step with the contact that Psi feels, for which there is no search.
 
     A vertex feels the plane of the face, of its candidates, whose centroid is nearest.
 
@@ -51,8 +51,7 @@ def felt(step: TimeStep, held: Array, body: Array, faces: Array, candidates: Arr
     apart = held[:, None] - points[candidates]
     nearest = jnp.argmin(jnp.sum(apart * apart, axis=-1), axis=1)
     face = jnp.take_along_axis(candidates, nearest[:, None], axis=1)[:, 0]
-    contact = step.contact._replace(point_next=points[face], normal_next=normals[face])
-    return step._replace(contact=contact, edge_contact=None, self_contact=None, touching=None)
+    return step._replace(contact=step.contact._replace(point_next=points[face], normal_next=normals[face]))
 
 
 def reduced(
