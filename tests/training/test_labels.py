@@ -29,7 +29,9 @@ def toy():
         config,
         motions=("walk_0", "dance_0"),
         stage2=dataclasses.replace(config.stage2, forces=True),
-        labels=LabelsConfig(rounds=2, simulations=2, frames=5, candidate_rollouts=1, external=0.0, steps=20, batch=8),
+        labels=LabelsConfig(
+            rounds=2, simulations=2, frames=5, candidate_rollouts=1, external=0.0, noise=0.0, steps=20, batch=8
+        ),
     )
     experiment = assembly.assemble(config)
     clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
@@ -153,6 +155,8 @@ def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finish
     after = finished.simulations
     on = after.frame == first.frame + 5
     assert on.any()  # the others began anew
+    # a blank Psi is not followed: the cloth is where the last label is
+    np.testing.assert_allclose(after.cloth.latent[on], finished.labels.target[4::5][on], atol=1e-6)
     again = collected(toy, collect, toy[3], after, seed=1)
     np.testing.assert_array_equal(again.labels.code[::5][on], after.cloth.latent[on])
 
@@ -176,6 +180,30 @@ def test_an_external_acceleration_moves_free_cloth_as_gravity_would(problem, toy
     expected = force(step)
     np.testing.assert_allclose(force(falling, "gravity"), expected, atol=1e-4 * float(jnp.abs(expected).max()))
     assert np.abs(force(step, "gravity") - expected).max() > 0.01 * np.abs(expected).max()
+
+
+@pytest.mark.slow
+def test_a_simulation_that_is_pushed_feels_it(toy, monkeypatch):
+    """The momentum of the first frame is that of a time step with the acceleration that was drawn."""
+    experiment, clips, params, blank = toy
+    scene, config = experiment.scene, experiment.config
+    push = jnp.array([3.0, GRAVITY, -2.0])
+    monkeypatch.setattr(labels, "draw_external", lambda *_: push)
+    pushed = collected(toy, labels.make_collect(scene, clips, config), blank).labels
+    simulation = pool.begin(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
+    character = pool.dressed(scene, simulation.betas, simulation.material, config)
+    poses = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
+    window = characters.window(scene, character, poses)
+    garment = partial(phi.decode, params["garment"], scene, character, window=window, config=config.model)
+
+    def momentum(external):
+        step = time_step.time_step(scene, character, simulation.cloth, window, 1 / config.fps, config, external)
+        held, near = simulation.cloth.latent, blank.normalizers.candidates
+        return forces.reduced(lambda z: garment(latent=z), held, step, window, scene, near, config.physics)[0]
+
+    expected = momentum(push)
+    np.testing.assert_allclose(pushed.forces[0, 0], expected, atol=1e-3 * float(jnp.abs(expected).max()))
+    assert np.abs(expected - momentum(None)).max() > 0.1 * np.abs(expected).max()
 
 
 def test_external_accelerations_are_mostly_none_and_never_beyond_the_most():
