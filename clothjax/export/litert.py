@@ -15,14 +15,14 @@ import numpy as np
 
 from clothjax.export import frame, sidecar
 from clothjax.runtime import inference
-from clothjax.runtime.models import Model
+from clothjax.runtime.models import Model, PosePredictor
 from clothjax.types import Array, Motion, Pose
 
 
 def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict | None = None) -> Path:
     """Write one frame of a model as a .tflite of built-in operators, and a JSON as `to_onnx` does.
 
-    The only signature has the arguments `frame.ARGUMENTS` and the results `frame.RESULTS`.
+    The only signature has the arguments `frame.arguments` and the results `frame.results`.
 
     Args:
         int8: matrices in eight bits, quantised dynamically, except those that read the pose and those that skin; use
@@ -44,7 +44,7 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
 
     @tensorflow.function(input_signature=arguments, autograph=False)
     def named(*values):
-        return dict(zip(frame.RESULTS, traced(*values), strict=True))
+        return dict(zip(frame.results(model), traced(*values), strict=True))
 
     owner: Any = tensorflow.Module()  # without one a file has no signature
     owner.frame = named
@@ -65,7 +65,10 @@ def _partly_quantised(model: Model) -> Callable:
 
     def hidden(latent: Array, *others: Array) -> tuple:
         zero = jnp.where(jnp.abs(latent[0]) < 0.0, 1.0, 0.0)  # also of NaN
-        network = model.network._replace(pose=model.network.pose + zero, weights=model.network.weights + zero)
+        predictor = model.network.predictor
+        if isinstance(predictor, PosePredictor):
+            predictor = predictor._replace(pose=predictor.pose + zero)
+        network = model.network._replace(predictor=predictor, weights=model.network.weights + zero)
         return frame.function(dataclasses.replace(model, network=network))(latent, *others)
 
     return hidden
@@ -88,10 +91,11 @@ def run_litert(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
         raise ImportError("LiteRT is not installed: pip install ai-edge-litert") from error
     run = Interpreter(model_path=str(path), num_threads=1).get_signature_runner()
     rotations, translation = (np.asarray(x, np.float32) for x in (motion.rotations, motion.translation))
-    state = inference.initial_state(model, Pose(rotations[0], translation[0]))[:-1]
+    state = frame.state_arrays(inference.initial_state(model, Pose(rotations[0], translation[0])))
+    external = [np.zeros(3, np.float32)] if "external" in frame.arguments(model) else []
     vertices = []
     for pose in zip(rotations, translation, strict=True):
-        results = run(**dict(zip(frame.ARGUMENTS, (*map(np.asarray, state), *pose), strict=True)))
-        state = [results[name] for name in frame.RESULTS[: len(state)]]
+        results = run(**dict(zip(frame.arguments(model), (*state, *pose, *external), strict=True)))
+        state = [results[name] for name in frame.results(model)[: len(state)]]
         vertices.append(results["vertices"])
     return np.stack(vertices)

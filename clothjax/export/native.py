@@ -47,11 +47,11 @@ def packed(model: Model) -> bytes:
 
 def _arrays(model: Model) -> Iterator[np.ndarray]:
     """Yield the arrays of a file in their order."""
-    network, wearer = model.network, model.wearer
+    network, wearer, predictor = model.network, model.wearer, model.network.predictor
     code = len(network.first)
     head = (
         MAGIC, VERSION, len(model.parents), len(model.input_joints), len(model.moving), wearer.template.shape[1], code,
-        len(network.hidden), len(network.decoder), len(network.read.bias) > network.width,
+        len(predictor.hidden), len(network.decoder), len(network.read.bias) > network.width,
         model.config.model.blendshape_relu, network.mix is not None, bool(wearer.known), 0, 0, 0,
     )  # fmt: skip
     yield np.array(head, np.int32)
@@ -61,13 +61,13 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     yield np.asarray(wearer.joints, np.float32)
     weights = np.asarray(network.weights, np.float32)
     yield np.pad(weights, [(0, 0), (0, -weights.shape[1] % LANES)])
-    yield np.asarray(network.pose_mean, np.float32)
-    yield from _bounds(network.pose_bounds, len(network.pose_mean))
+    yield np.asarray(predictor.pose_mean, np.float32)
+    yield from _bounds(predictor.pose_bounds, len(predictor.pose_mean))
     yield from _bounds(network.code_bounds, code)
     yield np.asarray(network.first, np.float32)
-    yield from _layer(Layer(network.pose, network.code.bias + wearer.bias), gains=True)
-    yield from _layer(network.code._replace(bias=np.zeros(len(wearer.bias))))
-    for layer in network.hidden:
+    yield from _layer(Layer(predictor.pose, predictor.code.bias + wearer.bias), gains=True)
+    yield from _layer(predictor.code._replace(bias=np.zeros(len(wearer.bias))))
+    for layer in predictor.hidden:
         yield from _layer(layer)
     yield from _layer(network.read, gains=True)
     for layer in network.decoder:

@@ -88,7 +88,7 @@ def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
 
 def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[dict, dict, Graph]:
     """Return the inputs, the outputs and the graph of one frame, which follows `inference.step`."""
-    g, network, wearer = Graph(int8), model.network, model.wearer
+    g, network, wearer, predictor = Graph(int8), model.network, model.wearer, model.network.predictor
     joints, count = np.asarray(wearer.joints, np.float32), len(model.parents)
     sound, pose, last = _sound(g, count)
     chain = _chain(g, g.reshape(g.slice(pose, 2, 0, 9 * count), count, 3, 3), joints, np.array(model.parents))
@@ -96,8 +96,8 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     frames = g("Concat", g("Concat", pose, places, axis=2), "history", axis=1)
     g.slice(frames, 1, 0, 2, "next_history")
     inputs, order = _inputs(g, frames, last, joints[model.input_joints[0]], model)
-    inputs = g("Sub", inputs, np.asarray(network.pose_mean)[order])
-    bounds = network.pose_bounds
+    inputs = g("Sub", inputs, np.asarray(predictor.pose_mean)[order])
+    bounds = predictor.pose_bounds
     inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
     latent, strayed = predicted(g, inputs, model, order)
     slack = np.concatenate([np.asarray(bounds.slack)[order], np.asarray(network.code_bounds.slack)])
@@ -206,18 +206,18 @@ def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tu
 
 def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:
     """Return the next code [N, C], named `next_latent`, and the distance by which it was clipped."""
-    network = model.network
-    code = network.code
-    first = np.asarray(network.pose)[order]
+    network, predictor = model.network, model.network.predictor
+    code = predictor.code
+    first = np.asarray(predictor.pose)[order]
     bias = np.asarray(code.bias) + np.asarray(model.wearer.bias)
-    limits = [np.maximum(-np.asarray(b.low), np.asarray(b.high)) for b in (network.pose_bounds, network.code_bounds)]
+    limits = [np.maximum(-np.asarray(b.low), np.asarray(b.high)) for b in (predictor.pose_bounds, network.code_bounds)]
     limits[0] = limits[0][order]
     if isinstance(code, FoldedLayer):
         x = g("Add", g.balanced(inputs, limits[0], Layer(first, bias)), g.slice("latent", 1, 0, len(bias)))
     else:
         both = g("Concat", inputs, "latent", axis=1)
         x = g.balanced(both, np.concatenate(limits), Layer(np.concatenate([first, np.asarray(code.kernel)]), bias))
-    for layer in network.hidden:
+    for layer in predictor.hidden:
         x = g.layer(g("Relu", x), layer)
     decayed = g("Mul", "latent", np.float32(1.0 - model.config.stage2.latent_decay))
     bounds = network.code_bounds

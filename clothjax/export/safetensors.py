@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,25 @@ import numpy as np
 
 from clothjax.config import Config
 from clothjax.files import configuration, damage
-from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model, Network, Wearer
+from clothjax.files.checkpoint import nested
+from clothjax.networks.normalisation import ForceScales, Whitening
+from clothjax.runtime.models import (
+    Bounds,
+    Cloth,
+    FoldedLayer,
+    ForcePredictor,
+    Layer,
+    Model,
+    Network,
+    PosePredictor,
+    Shown,
+    Wearer,
+)
+from clothjax.types import Material, Mesh, Rest
 
-FORMAT = 1  # of the file; readers refuse a newer one
+Fields = TypeVar("Fields", bound=NamedTuple)
+
+FORMAT = 2  # of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
 
 
@@ -44,7 +61,10 @@ def from_safetensors(path: str | Path) -> Model:
         with library.safe_open(str(path), framework="numpy") as file:
             about = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
             arrays = {name: jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())}  # not a dict
-        damage.refuse_newer(path, about.get("format", 1), FORMAT)
+        version = about.get("format", 1)
+        damage.refuse_newer(path, version, FORMAT)
+        if version == 1:
+            arrays = {_renamed(name): array for name, array in arrays.items()}
         config = configuration.from_dict(Config, about["config"], str(path))
         static = {field: tuple(about[name]) for name, field in STATIC.items()}
 
@@ -55,28 +75,56 @@ def from_safetensors(path: str | Path) -> Model:
             return layer(name) if f"{name}.kernel" in arrays else FoldedLayer(arrays[f"{name}.bias"])
 
         def layers(name: str) -> tuple[Layer, ...]:
-            count = sum(key.startswith(f"network.{name}.") and key.endswith(".bias") for key in arrays)
-            return tuple(layer(f"network.{name}.{i}") for i in range(count))
+            count = sum(key.startswith(f"{name}.") and key.endswith(".bias") for key in arrays)
+            return tuple(layer(f"{name}.{i}") for i in range(count))
+
+        def fields(of: type[Fields], name: str, **others) -> Fields:
+            return of(*(others[field] if field in others else arrays[f"{name}.{field}"] for field in of._fields))
 
         def bounds(name: str) -> Bounds:
-            return Bounds(*(arrays[f"network.{name}.{field}"] for field in Bounds._fields))
+            return Bounds(*(arrays[f"{name}.{field}"] for field in Bounds._fields))
 
-        network = Network(
-            **{name: arrays[f"network.{name}"] for name in ("pose", "pose_mean", "first", "shapes", "weights")},
-            pose_bounds=bounds("pose_bounds"),
-            code_bounds=bounds("code_bounds"),
-            code=reader("network.code"),
+        own = "network.predictor"
+        if config.stage2.forces:
+            within = f"{own}.params."
+            params = {
+                name.removeprefix(within).replace(".", "/"): x for name, x in arrays.items() if name.startswith(within)
+            }
+            felt = fields(Shown, f"{own}.felt") if f"{own}.felt.shapes" in arrays else None
+            whitening = fields(Whitening, f"{own}.scales.whitening")
+            scales = fields(ForceScales, f"{own}.scales", whitening=whitening)
+            parts = {"params": nested(params), "scales": scales, "mesh": fields(Mesh, f"{own}.mesh"), "felt": felt}
+            predictor = fields(ForcePredictor, own, **parts, corrections=arrays.get(f"{own}.corrections"))
+            worn = "wearer.cloth"
+            parts = {"rest": fields(Rest, f"{worn}.rest"), "material": fields(Material, f"{worn}.material")}
+            cloth = fields(Cloth, worn, **parts, template=arrays.get(f"{worn}.template"))
+        else:
+            parts = {"pose_bounds": bounds(f"{own}.pose_bounds"), "code": reader(f"{own}.code")}
+            predictor = fields(PosePredictor, own, **parts, hidden=layers(f"{own}.hidden"))
+            cloth = None
+        network = fields(
+            Network,
+            "network",
+            predictor=predictor,
+            code_bounds=bounds("network.code_bounds"),
             read=reader("network.read"),
             mix=layer("network.mix") if "network.mix.bias" in arrays else None,
-            hidden=layers("hidden"),
-            decoder=layers("decoder"),
+            decoder=layers("network.decoder"),
         )
-        wearer = Wearer(*(arrays[f"wearer.{field}"] for field in Wearer._fields))
+        wearer = fields(Wearer, "wearer", cloth=cloth)
         return Model(network=network, wearer=wearer, faces=arrays["faces"], config=config, **static)
     except damage.NewerFormat:
         raise
     except (library.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(f"{path}: not a whole model in safetensors ({error}); convert it again") from error
+
+
+def _renamed(name: str) -> str:
+    """Return the name that an array of format 1 has now."""
+    parts = name.split(".")
+    if parts[0] == "network" and parts[1] in PosePredictor._fields:
+        parts.insert(1, "predictor")
+    return ".".join(parts)
 
 
 def _library():

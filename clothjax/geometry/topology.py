@@ -32,6 +32,15 @@ def mesh(faces: np.ndarray, vertex_count: int | None = None) -> Mesh:
     return Mesh(faces, np.concatenate([left, right[:, 2:]], axis=1).astype(np.int32), edges(faces))
 
 
+def free_mesh(faces: np.ndarray, pinned: np.ndarray) -> Mesh:
+    """Build the `mesh` of the faces, hinges and edges that have a vertex which is not pinned.
+
+    Args:
+        pinned: [V] bool.
+    """
+    return Mesh(*(elements[~pinned[elements].all(axis=1)] for elements in mesh(faces, len(pinned))))
+
+
 def edges(faces: np.ndarray) -> np.ndarray:
     """Return the undirected edges [E, 2] int32 of faces [F, 3], lower index first, sorted, without repeats."""
     return np.unique(_corners(_checked(faces))[1], axis=0).astype(np.int32).reshape(-1, 2)

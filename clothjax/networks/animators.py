@@ -14,7 +14,7 @@ from clothjax.networks.message_passing import Block
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.networks.psi import Psi, constant_inputs, next_code, window_inputs
-from clothjax.simulation.characters import Character
+from clothjax.simulation.characters import Character, surface
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array
@@ -162,7 +162,15 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
 
             held, change = jax.lax.stop_gradient((inputs.state.latent, inputs.state.change))
             pulls = jax.lax.stop_gradient(
-                forces.reduced(decode, held, inputs.time_step, inputs.window, scene, scales.candidates, config.physics)
+                forces.reduced(
+                    decode,
+                    held,
+                    inputs.time_step,
+                    surface(scene, inputs.window.following),
+                    scales.candidates,
+                    scene.mesh,
+                    config.physics,
+                )
             )
             code = next_code(model["params"], scales, held, change, pulls, constants, config.stage2)
             code += jax.lax.stop_gradient(jnp.clip(code, scales.low, scales.high) - code)

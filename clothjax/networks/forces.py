@@ -8,17 +8,14 @@ import numpy as np
 
 from clothjax.config import PhysicsConfig
 from clothjax.networks.normalisation import Whitening
-from clothjax.physics import contact_search, incremental_potential
+from clothjax.physics import elastic_forces, incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.simulation.characters import Window
-from clothjax.simulation.scene import Scene
-from clothjax.types import Array
+from clothjax.types import Array, Contact, Mesh
 
-KINDS = {
-    "momentum": ("inertia", "gravity"),  # to where the cloth would fly freely
-    "elasticity": ("stretching", "bending"),
-    "contact": ("collision",),
-}
+MOMENTUM = ("inertia", "gravity")  # to where the cloth would fly freely
+ELASTICITY = ("stretching", "bending")
+CONTACT = ("collision",)
+KINDS = {"momentum": MOMENTUM, "elasticity": ELASTICITY, "contact": CONTACT}
 """Terms of the incremental potential that make up each kind of force. Friction, and contact of edges
 and of cloth with itself, are not felt."""
 SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its largest
@@ -34,51 +31,66 @@ def whitening(inverse_hessian: Array) -> Whitening:
     )
 
 
-def felt(step: TimeStep, held: Array, body: Array, faces: Array, candidates: Array) -> TimeStep:
-    """Return a time step with the contact that Psi feels, for which there is no search.
-
-    A vertex feels the plane of the face, of its candidates, whose centroid is nearest.
+def felt(position: Array, surface: tuple[Array, Array], candidates: Array) -> Contact:
+    """Return the planes that Psi feels, for which there is no search: of each vertex's nearest candidate.
 
     Args:
-        held: [V, 3] m, the held garment at the next frame.
-        body: [B, 3] m at the next frame.
-        faces: [F, 3] of the body.
+        position: [V, 3] m, the held garment at the next frame.
+        surface: centroids [F, 3] m and unit normals [F, 3] of the body's faces at the next frame.
         candidates: [V, K] int32, faces.
     """
-    if step.contact is None:
-        return step
-    points, normals = contact_search.centroids(body, faces)
-    apart = held[:, None] - points[candidates]
-    nearest = jnp.argmin(jnp.sum(apart * apart, axis=-1), axis=1)
-    face = jnp.take_along_axis(candidates, nearest[:, None], axis=1)[:, 0]
-    return step._replace(contact=step.contact._replace(point_next=points[face], normal_next=normals[face]))
+    points, normals = surface
+    nearest, face = jnp.full(len(position), jnp.inf), candidates[:, 0]
+    for each in candidates.T:  # an argmin would take several times as long
+        apart = sum((position[:, axis] - points[:, axis][each]) ** 2 for axis in range(3))
+        nearest, face = jnp.minimum(nearest, apart), jnp.where(apart < nearest, each, face)
+    point, normal = points[face], normals[face]
+    return Contact(point, point, normal, normal, face)
+
+
+def on_vertices(
+    position: Array,
+    step: TimeStep,
+    surface: tuple[Array, Array] | None,
+    candidates: Array,
+    mesh: Mesh,
+    config: PhysicsConfig,
+) -> Array:
+    """Return the forces [3, V, 3] in N on a garment: for each of `KINDS`, minus the gradient of its energies.
+
+    Args:
+        position: [V, 3] m, the held garment at the next frame.
+        step: the time step; its contact is not used.
+        surface: as of `felt`; None where there is no body to touch.
+        candidates: [V, K] int32, as of `felt`.
+    """
+    step = step._replace(contact=None if surface is None else felt(position, surface, candidates))
+
+    def force(names: tuple[str, ...]) -> Array:
+        def energy(new: Array) -> Array:
+            terms = incremental_potential.energies(new, step, mesh, config)
+            return sum((terms[name] for name in names if name in terms), jnp.zeros(()))
+
+        return -jax.grad(energy)(position)
+
+    elastic = elastic_forces.elastic(position, step.rest, step.material, mesh)
+    return jnp.stack([force(MOMENTUM), elastic, force(CONTACT)])
 
 
 def reduced(
     garment: Callable[[Array], Array],
     code: Array,
     step: TimeStep,
-    window: Window,
-    scene: Scene,
+    surface: tuple[Array, Array] | None,
     candidates: Array,
+    mesh: Mesh,
     config: PhysicsConfig,
 ) -> Array:
-    """Return the forces [3, L] in J on a code [L]: for each of `KINDS`, minus the gradient of its energies.
+    """Return the forces [3, L] in J on a code [L]: `on_vertices`, pulled back to the code.
 
     Args:
         garment: from a code to vertices [V, 3] m at the next frame.
-        window: the character around the step.
-        candidates: [V, K] int32, as of `felt`.
     """
     position, pullback = jax.vjp(garment, code)
-    step = felt(step, position, window.following.body, jnp.asarray(scene.body.faces), candidates)
-
-    def force(names: tuple[str, ...]) -> Array:
-        def energy(new: Array) -> Array:
-            terms = incremental_potential.energies(new, step, scene.mesh, config)
-            return sum((terms[name] for name in names if name in terms), jnp.zeros(()))
-
-        return -jax.grad(energy)(position)
-
-    on_vertices = jnp.stack([force(names) for names in KINDS.values()])
-    return jax.vmap(lambda force: pullback(force)[0])(on_vertices)
+    forces = on_vertices(position, step, surface, candidates, mesh, config)
+    return jax.vmap(lambda force: pullback(force)[0])(forces)

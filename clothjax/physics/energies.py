@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from clothjax.geometry.vectors import norm
-from clothjax.types import Array, Mesh, Rest, Scalar
+from clothjax.types import Array, Garment, Mesh, Rest, Scalar
 
 GRAVITY = 9.81  # m/s^2
 THICKNESS = 4.7e-4  # m, of the StVK membrane in HOOD and SNUG
@@ -72,6 +72,19 @@ def regional(
         face_area=rest.face_area * jnp.mean(stretching[mesh.faces], axis=1),
         hinge_area=rest.hinge_area / jnp.mean(bending[mesh.hinges], axis=1),  # the bending energy divides by it
     ), areas * cloth[:, 0]
+
+
+def cloth_measures(
+    garment: Garment, template: Float[Array, "V 3"] | None, mesh: Mesh
+) -> tuple[Rest, Float[Array, " V"]]:
+    """Return the rest measures of a garment and its vertex areas [V] m^2, weighted by its cloth.
+
+    Args:
+        template: [V, 3] m, the garment shaped to its wearer; None for the shape as modelled.
+    """
+    measured = jnp.asarray(garment.vertices) if template is None else template
+    rest, areas = rest_measures(measured, mesh), vertex_areas(measured, garment.faces)
+    return (rest, areas) if garment.cloth is None else regional(rest, areas, mesh, jnp.asarray(garment.cloth))
 
 
 def green_strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> Float[Array, "F 2 2"]:

@@ -18,26 +18,33 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.networks import normalisation, psi
-from clothjax.runtime.models import Layer, Model, Network, State, Wearer
+from clothjax.runtime import drape
+from clothjax.runtime.models import Layer, Model, PosePredictor, State, Wearer
 from clothjax.types import Array, Motion, Pose
 
 FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
+SETTLING = 60  # frames that a garment with forces settles for before the first
 T = TypeVar("T")
-HIGHEST = jax.lax.Precision.HIGHEST
 
 
 @jax.jit
 def initial_state(model: Model, pose: Pose) -> State:
-    """Return the state before the first frame: a code of zero, and a character that has been standing in `pose`.
+    """Return the state before the first frame, of a character that has been standing in `pose`.
 
-    The canonical pose replaces one that is not finite.
+    The code is zero; that of a Psi with forces has settled for `SETTLING` frames. The canonical pose replaces one that
+    is not finite.
     """
     pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
     still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
     pose, ok = _sound_or(pose, still)
-    _, positions = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
-    rotations, positions, translation = (jnp.stack([x, x]) for x in (pose.rotations, positions, pose.translation))
-    return State(model.network.first, rotations, positions, translation, ok)
+    rotation, places = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
+    rotations, positions, translation = (jnp.stack([x, x]) for x in (pose.rotations, places, pose.translation))
+    state = State(model.network.first, rotations, positions, translation, ok)
+    if isinstance(model.network.predictor, PosePredictor):
+        return state
+    state = state._replace(drape=drape.begin(model, state.latent, _transforms(model, rotation, places)))
+    settled = jax.lax.fori_loop(0, SETTLING, lambda _, state: _advanced(model, state, pose, None, False)[0], state)
+    return settled._replace(ok=ok)
 
 
 def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
@@ -47,13 +54,26 @@ def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
 
 
 @partial(jax.jit, static_argnames="vertices")
-def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
+def step(
+    model: Model, state: State, pose: Pose, vertices: bool = True, external: Array | None = None
+) -> tuple[State, Array | None]:
     """Compute the next frame: a new state, and the garment's vertices [V, 3] m in the world.
 
     Args:
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
         vertices: False for a garment that nobody sees: only the state goes on, and the vertices are None.
+        external: [3] m/s^2, an acceleration of the cloth beside gravity, such as wind; only of a Psi with forces.
+
+    Raises:
+        ValueError: for an external acceleration of a Psi without forces.
     """
+    return _advanced(model, state, pose, external, vertices)
+
+
+def _advanced(
+    model: Model, state: State, pose: Pose, external: Array | None, vertices: bool
+) -> tuple[State, Array | None]:
+    """Compute the next frame as `step` does, which is compiled apart."""
     network, wearer, parents = model.network, model.wearer, np.array(model.parents)
     pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
     global_rotations, joints = skinning.forward_kinematics(pose.rotations, wearer.joints, parents)
@@ -62,52 +82,39 @@ def step(model: Model, state: State, pose: Pose, vertices: bool = True) -> tuple
         for new, old in zip((pose.rotations, joints, pose.translation), state[1:4], strict=True)
     )
     advance = translation[:2] - translation[1:]
-    inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.input_joints), model.config.fps)
-    inputs, ordinary = normalisation.bounded(inputs - network.pose_mean, *network.pose_bounds)
-    latent, inside = normalisation.bounded(
-        predict(network, state.latent, inputs, wearer.bias, model.config), *network.code_bounds
-    )
+    transforms = _transforms(model, global_rotations, joints)
+    hung = state.drape
+    if isinstance(network.predictor, PosePredictor):
+        if external is not None:
+            raise ValueError("this model feels no external acceleration: it was trained without stage2.forces")
+        inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.input_joints), model.config.fps)
+        inputs, ordinary = normalisation.bounded(inputs - network.predictor.pose_mean, *network.predictor.pose_bounds)
+        latent = predict(network.predictor, state.latent, inputs, wearer.bias, model.config)
+        latent, inside = normalisation.bounded(latent, *network.code_bounds)
+    else:
+        latent = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
+        latent, inside = normalisation.bounded(latent, *network.code_bounds)
+        hung, ordinary = drape.follow(model, latent, state.latent, hung, transforms, advance[0]), True
     ok = sound & ordinary & wearer.known & inside
-    following = State(latent, rotations[:2], positions[:2], translation[:2], ok)
+    following = State(latent, rotations[:2], positions[:2], translation[:2], ok, hung)
     if not vertices:
         return following, None
-    displaced = jnp.matmul(blend_weights(network, latent, model.config), network.shapes, precision=HIGHEST)
-    transforms = skinning.bound_transforms(global_rotations, joints, wearer.joints)
-    garment = wearer.template + displaced.reshape(3, -1)
-    return following, _skin(garment, network.weights, transforms[np.array(model.moving)], pose.translation)
+    return following, drape.shown(model, latent, hung, transforms) + pose.translation[None]
 
 
-def predict(network: Network, latent: Array, inputs: Array, bias: Array, config: Config) -> Array:
+def _transforms(model: Model, rotation: Array, places: Array) -> Array:
+    """Return the transforms [J', 3, 4] of the joints `Model.moving`, from `skinning.forward_kinematics`."""
+    return skinning.bound_transforms(rotation, places, model.wearer.joints)[np.array(model.moving)]
+
+
+def predict(predictor: PosePredictor, latent: Array, inputs: Array, bias: Array, config: Config) -> Array:
     """Return the next code [C] from the current one, pose inputs [P] and the character's part [H] of the bias."""
-    code = network.code
+    code = predictor.code
     x = latent @ code.kernel if isinstance(code, Layer) else latent[: len(bias)]
-    x = inputs @ network.pose + x + code.bias + bias
-    for layer in network.hidden:
+    x = inputs @ predictor.pose + x + code.bias + bias
+    for layer in predictor.hidden:
         x = jax.nn.relu(x) @ layer.kernel + layer.bias
     return (1.0 - config.stage2.latent_decay) * latent + x
-
-
-def blend_weights(network: Network, latent: Array, config: Config) -> Array:
-    """Return the weights [K] of the blend shapes `Network.shapes` for a code [C]."""
-    read = network.read
-    product = latent @ read.kernel if isinstance(read, Layer) else latent[-len(read.bias) :]
-    x, skip = jnp.split(read.bias + product, [network.width])
-    for layer in network.decoder:
-        x = jax.nn.relu(x) @ layer.kernel + layer.bias
-    weights = x + skip if config.model.decoder_skip else x
-    weights = jax.nn.relu(weights) if config.model.blendshape_relu else weights
-    return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
-
-
-def _skin(garment: Array, weights: Array, transforms: Array, translation: Array) -> Array:
-    """Skin a garment [3, V] by the transforms [J', 3, 4] of joints with weights [J', V]; return vertices [V, 3] m.
-
-    It works coordinate by coordinate, because processors are fast at long rows.
-    """
-    flat = transforms.reshape(-1, 12).T
-    rows = jnp.matmul(flat, weights, precision=HIGHEST).reshape(3, 4, -1)
-    x, y, z = (rows[:, i] * garment[None, i] for i in range(3))
-    return (x + y + z + rows[:, 3] + translation[:, None]).T
 
 
 @jax.jit
@@ -116,10 +123,15 @@ def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
 
     Args:
         before, after: the states around the step.
-        tolerance: of the code, in standard deviations; a tenth of it, in rad and m, of the poses.
+        tolerance: of the code, in standard deviations; a tenth of it, in rad and m, of the poses and, with forces, of
+            the cloth in place of the code.
     """
-    still = [jnp.max(jnp.abs(x[0] - x[1])) < 0.1 * tolerance for x in (after.rotations, after.translation)]
-    return still[0] & still[1] & (jnp.max(jnp.abs(after.latent - before.latent)) < tolerance)
+    moved = [x[0] - x[1] for x in (after.rotations, after.translation)]
+    if after.drape is None:
+        moved.append(0.1 * (after.latent - before.latent))
+    else:  # its code is not in standard deviations
+        moved.append(after.drape.velocity)
+    return jnp.all(jnp.stack([jnp.max(jnp.abs(x)) < 0.1 * tolerance for x in moved]))
 
 
 @jax.jit

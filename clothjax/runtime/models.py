@@ -14,13 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.body import skinning
+from clothjax.body import reach, skinning
 from clothjax.config import Config
 from clothjax.files import storage
+from clothjax.geometry import topology
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
+from clothjax.physics import energies
 from clothjax.runtime import trained
-from clothjax.types import Array, Body, Garment, Material
+from clothjax.types import Array, Body, Garment, Material, Mesh, Rest
+
+FORCE_SLACK = 0.0125  # of the range of a code of a Psi with forces, a tenth of a deviation: how far out is still inside
 
 
 class Layer(NamedTuple):
@@ -48,6 +52,35 @@ class Bounds(NamedTuple):
     slack: Array  # how far out still counts as inside
 
 
+class PosePredictor(NamedTuple):
+    """The latent predictor of a Psi that reads the pose."""
+
+    pose: Array  # [P, H] kernel of the first layer
+    pose_mean: Array  # [P] mean of the inputs, subtracted first
+    pose_bounds: Bounds  # [P] of the centred inputs
+    code: Layer | FoldedLayer  # [C, H] of the same layer, without the character's part of the bias
+    hidden: tuple[Layer, ...]  # the last of which gives [C]
+
+
+class Shown(NamedTuple):
+    """A garment as the decoder moves it: blend shapes and skinning weights."""
+
+    shapes: Array  # [K, 3 V] m, the x of all vertices first; zero where they are pinned
+    weights: Array  # [J', V] skinning weights of the joints `Model.moving`
+
+
+class ForcePredictor(NamedTuple):
+    """The latent predictor of a Psi with forces, and the geometry on which it feels them."""
+
+    params: dict  # of `psi.ForcePsi`
+    scales: ForceScales
+    mesh: Mesh  # of the garment's elements
+    faces: Array  # [F, 3] int32 of the part of the body that can be touched
+    body: Array  # [J', B] skinning weights of that part
+    corrections: Array | None  # [B, 3, 9 (J - 1)] m, its pose blend shapes
+    felt: Shown | None  # the garment that feels, if it is not the one that is shown
+
+
 class Network(NamedTuple):
     """The arrays of Psi that all characters share: latent predictor, decoder, blend shapes, skinning weights.
 
@@ -55,11 +88,7 @@ class Network(NamedTuple):
     carries: the code, C = L, or its products with the layers that read it, if the model is specialised.
     """
 
-    pose: Array  # [P, H] kernel of the predictor's first layer
-    pose_mean: Array  # [P] mean of the inputs, subtracted first
-    pose_bounds: Bounds  # [P] of the centred inputs
-    code: Layer | FoldedLayer  # [C, H] of the same layer, without the character's part of the bias
-    hidden: tuple[Layer, ...]  # of the predictor, the last of which gives [C]
+    predictor: PosePredictor | ForcePredictor
     code_bounds: Bounds  # [C]
     first: Array  # [C] the code before the first frame
     read: Layer | FoldedLayer  # [C, D] the decoder's first layer; with a skip [C, D + K], the last K being the skip
@@ -71,7 +100,7 @@ class Network(NamedTuple):
     @property
     def folded(self) -> bool:
         """True if `specialise` has folded the code into the layers around it."""
-        return isinstance(self.code, FoldedLayer)
+        return isinstance(self.read, FoldedLayer)
 
     @property
     def width(self) -> int:
@@ -79,13 +108,25 @@ class Network(NamedTuple):
         return len(self.decoder[0].kernel)
 
 
+class Cloth(NamedTuple):
+    """What a Psi with forces must know of its character: its cloth, and the body that it can touch."""
+
+    constants: Array  # [C] of `psi.constant_inputs`
+    mass: Array  # [V] kg
+    rest: Rest
+    material: Material
+    body: Array  # [B, 3] m in the canonical pose
+    template: Array | None  # [3, V] m, of the garment that feels, if it is not the one that is shown
+
+
 class Wearer(NamedTuple):
     """The arrays of a model that depend on its character: on betas and material."""
 
-    bias: Array  # [H] added to the predictor's first layer
+    bias: Array  # [H] added to the predictor's first layer; [0] with forces
     template: Array  # [3, V] m, the shaped garment in the canonical pose
     joints: Array  # [J, 3] m of the shaped body
     known: Array  # bool, True if the character is within the range of training
+    cloth: Cloth | None = None  # with forces
 
 
 @partial(
@@ -107,6 +148,18 @@ class Model:
     config: Config
 
 
+class Drape(NamedTuple):
+    """How the garment hangs and moves, which a Psi with forces feels. Positions are relative to the root's translation.
+
+    V are the vertices of the garment that feels.
+    """
+
+    change: Array  # [L] of the code in the last frame
+    garment: Array  # [3, V] m, in the canonical pose
+    position: Array  # [V, 3] m
+    velocity: Array  # [V, 3] m per frame
+
+
 class State(NamedTuple):
     """What a model carries from frame to frame."""
 
@@ -115,6 +168,7 @@ class State(NamedTuple):
     positions: Array  # [2, J, 3] m of their joints, from the root's canonical place
     translation: Array  # [2, 3] m
     ok: Array  # bool, True if the last frame was within the range of training
+    drape: Drape | None = None  # with forces, whose code is not in standard deviations
 
 
 def build(
@@ -150,7 +204,14 @@ def build(
     cloth = config.material
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
-    network, wearer = _arrays(garment, body, garment_params, predictor, normalizers, betas, material, config)
+    touched = mesh = None
+    if isinstance(normalizers, ForceScales):
+        touched, candidates = _touched(garment, body, normalizers.candidates, config)
+        normalizers = normalizers._replace(candidates=candidates)
+        mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
+    network, wearer = _arrays(
+        garment, body, touched, mesh, garment_params, predictor, normalizers, betas, material, config
+    )
     return Model(
         network=network,
         wearer=wearer,
@@ -163,51 +224,79 @@ def build(
     )
 
 
+def _touched(garment: Garment, body: Body, candidates: Array, config: Config) -> tuple[Body, np.ndarray]:
+    """Return the part of a body that candidates are of, and the candidates [V, K] int32 numbered among its faces."""
+    within = reach.reachable(body, garment, config.physics.reach)
+    used, numbered = np.unique(np.asarray(candidates), return_inverse=True)
+    faces = np.asarray(within.faces)[used]
+    vertices, renumbered = np.unique(faces, return_inverse=True)
+    touched = reach.part(within, vertices, renumbered.reshape(faces.shape).astype(np.int32))
+    return touched, numbered.reshape(np.shape(candidates)).astype(np.int32)
+
+
 @partial(jax.jit, static_argnames="config")
 def _arrays(
     garment: Garment,
     body: Body,
+    touched: Body | None,
+    mesh: Mesh | None,
     garment_params: dict,
     predictor: dict,
-    normalizers: Normalizers,
+    normalizers: Normalizers | ForceScales,
     betas: Array,
     material: Material,
     config: Config,
 ) -> tuple[Network, Wearer]:
-    """Build the arrays of a model in one compiled program, which starts faster than many small ones."""
-    constants, known = psi.bounded_constants(psi.constant_inputs(betas, material, config.material), config)
-    latent, pose = normalizers
-    size = len(latent.mean)
-    first, *hidden = _layers(predictor)
-    of_code, of_pose, of_constants = jnp.split(first.kernel, [size, size + len(pose.mean)])
+    """Build the arrays of a model in one compiled program, which starts faster than many small ones.
+
+    Args:
+        touched: the part of the body that is felt, and ...
+        mesh: ... the elements that feel; None without forces.
+    """
+    given = psi.constant_inputs(betas, material, config.material)
+    constants, known = psi.bounded_constants(given, config)
+    template = skinning.shaped_vertices(garment, betas)
+    bias, cloth, latent = jnp.zeros(0), None, None
+    if isinstance(normalizers, ForceScales):
+        assert touched is not None and mesh is not None
+        rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
+        shaped = skinning.shaped_vertices(touched, betas)
+        cloth = Cloth(constants, areas * material.density, rest, material, shaped, None)
+        corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
+        weights = jnp.asarray(touched.weights).T
+        parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, weights, corrections, None)
+        bounds = Bounds(normalizers.low, normalizers.high, FORCE_SLACK * (normalizers.high - normalizers.low))
+        first = jnp.zeros(len(normalizers.low))
+    else:
+        latent, pose = normalizers
+        size = len(latent.mean)
+        layer, *hidden = _layers(predictor)
+        of_code, of_pose, of_constants = jnp.split(layer.kernel, [size, size + len(pose.mean)])
+        bias = constants @ of_constants
+        ranges = pose.low * pose.deviation, pose.high * pose.deviation, jnp.full(len(pose.mean), normalisation.SLACK)
+        parts = PosePredictor(
+            of_pose / pose.deviation[:, None], pose.mean, Bounds(*ranges), Layer(of_code, layer.bias), tuple(hidden)
+        )
+        bounds = Bounds(latent.low, latent.high, jnp.full(size, normalisation.CODE_SLACK))
+        first = -latent.mean / latent.deviation
     read, *decoder = _layers(garment_params["decoder"])
     if config.model.decoder_skip:
         skip = jnp.asarray(garment_params["skip"])
         read = Layer(jnp.concatenate([read.kernel, skip], axis=1), jnp.pad(read.bias, (0, skip.shape[1])))
+    if latent is not None:
+        read = Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel)
     shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
     network = Network(
-        pose=of_pose / pose.deviation[:, None],
-        pose_mean=pose.mean,
-        pose_bounds=Bounds(
-            pose.low * pose.deviation, pose.high * pose.deviation, jnp.full(len(pose.mean), normalisation.SLACK)
-        ),
-        code=Layer(of_code, first.bias),
-        hidden=tuple(hidden),
-        code_bounds=Bounds(latent.low, latent.high, jnp.full(size, normalisation.CODE_SLACK)),
-        first=-latent.mean / latent.deviation,
-        read=Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel),
+        predictor=parts,
+        code_bounds=bounds,
+        first=first,
+        read=read,
         decoder=tuple(decoder),
         mix=None,
         shapes=jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1),
         weights=jnp.asarray(garment.weights).T,
     )
-    wearer = Wearer(
-        bias=constants @ of_constants,
-        template=skinning.shaped_vertices(garment, betas).T,
-        joints=skinning.shaped_joints(body, betas),
-        known=known,
-    )
-    return network, wearer
+    return network, Wearer(bias, template.T, skinning.shaped_joints(body, betas), known, cloth)
 
 
 def _layers(mlp: dict) -> list[Layer]:
@@ -249,12 +338,9 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
         material: default the configured one.
 
     Raises:
-        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found, or if its Psi reads
-            forces.
+        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
     """
     run_psi = trained.psi(trained.find(run))
-    if isinstance(run_psi.normalizers, ForceScales):
-        raise ValueError(f"{run}: a Psi with forces does not run outside training yet; `clothjax evaluate` measures it")
     body, names = storage.load_rig(run_psi.config.body)
     return build(
         run_psi.config,

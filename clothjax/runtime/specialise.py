@@ -12,8 +12,9 @@ import numpy as np
 from clothjax.body import skinning
 from clothjax.files import storage
 from clothjax.geometry import proximity
-from clothjax.runtime.inference import blend_weights, rollout
-from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model, Network
+from clothjax.runtime.drape import blend_weights
+from clothjax.runtime.inference import rollout
+from clothjax.runtime.models import Bounds, FoldedLayer, ForcePredictor, Layer, Model, Network, PosePredictor, Shown
 from clothjax.types import Array, Garment, Motion
 
 FOLD_RATIO = 0.75  # folding must leave at most this part of the weights of the layers around the code
@@ -52,20 +53,25 @@ def without_code(model: Model) -> Model:
     """Return the model with the code folded into the layers around it, if these then have much fewer weights.
 
     A linear layer gives the code and two layers read it: the predictor's first in the next frame, and the decoder's.
+    A predictor with forces reads more than the code, which then stays.
     """
-    network, code, read = model.network, model.network.code, model.network.read
-    if isinstance(code, FoldedLayer) or isinstance(read, FoldedLayer):
+    network, predictor, read = model.network, model.network.predictor, model.network.read
+    if (
+        isinstance(predictor, ForcePredictor)
+        or isinstance(predictor.code, FoldedLayer)
+        or isinstance(read, FoldedLayer)
+    ):
         return model
+    code = predictor.code
     readers = jnp.concatenate([code.kernel, read.kernel], axis=1)
-    *hidden, last = network.hidden
+    *hidden, last = predictor.hidden
     folded = Layer(_product(last.kernel, readers), _product(last.bias, readers))
     if folded.kernel.size > FOLD_RATIO * (last.kernel.size + readers.size):
         return model
     low, high, slack = network.code_bounds
     middle, radius = _product(0.5 * (low + high), readers), _product(0.5 * (high - low), jnp.abs(readers))
     network = network._replace(
-        code=FoldedLayer(code.bias),
-        hidden=(*hidden, folded),
+        predictor=predictor._replace(code=FoldedLayer(code.bias), hidden=(*hidden, folded)),
         code_bounds=Bounds(middle - radius, middle + radius, _product(slack, jnp.abs(readers))),
         first=_product(network.first, readers),
         read=FoldedLayer(read.bias),
@@ -90,6 +96,10 @@ def _equalised_shapes(network: Network, limits: np.ndarray) -> Network:
     """
     scale = smoothing_scale(limits, network.shapes)
     shapes = network.shapes * scale[:, None]
+    predictor = network.predictor
+    if isinstance(predictor, ForcePredictor) and predictor.felt is not None:
+        felt = predictor.felt._replace(shapes=predictor.felt.shapes * scale[:, None])
+        network = network._replace(predictor=predictor._replace(felt=felt))
     if network.mix is not None:
         mix = Layer(network.mix.kernel / scale[None], network.mix.bias / scale)
         return network._replace(mix=mix, shapes=shapes)
@@ -108,22 +118,33 @@ def _equalised_shapes(network: Network, limits: np.ndarray) -> Network:
 
 
 def _equalised_code(network: Network) -> Network:
-    """Scale the code, and the kernels that read it by the inverse; a folded network is returned as it is."""
-    code, read = network.code, network.read
-    if isinstance(code, FoldedLayer) or isinstance(read, FoldedLayer):
+    """Scale the code, and the kernels that read it by the inverse; one folded or with forces is returned as it is."""
+    predictor, read = network.predictor, network.read
+    if (
+        isinstance(predictor, ForcePredictor)
+        or isinstance(predictor.code, FoldedLayer)
+        or isinstance(read, FoldedLayer)
+    ):
         return network
+    code = predictor.code
     limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
     scale = smoothing_scale(limits, jnp.concatenate([code.kernel, read.kernel], axis=1))
-    return _divided_code(network, scale)._replace(
-        code=code._replace(kernel=code.kernel * scale[:, None]), read=read._replace(kernel=read.kernel * scale[:, None])
+    network = _divided_code(network, scale)
+    assert isinstance(network.predictor, PosePredictor)
+    return network._replace(
+        predictor=network.predictor._replace(code=code._replace(kernel=code.kernel * scale[:, None])),
+        read=read._replace(kernel=read.kernel * scale[:, None]),
     )
 
 
 def _divided_code(network: Network, scale: np.ndarray) -> Network:
     """Divide the code by `scale` [C] where it is made: last layer, bounds, first code. Who reads it must multiply."""
-    *hidden, last = network.hidden
+    predictor = network.predictor
+    assert isinstance(predictor, PosePredictor)
+    *hidden, last = predictor.hidden
+    hidden = (*hidden, Layer(last.kernel / scale[None], last.bias / scale))
     return network._replace(
-        hidden=(*hidden, Layer(last.kernel / scale[None], last.bias / scale)),
+        predictor=predictor._replace(hidden=hidden),
         code_bounds=Bounds(*(row / scale for row in network.code_bounds)),
         first=network.first / scale,
     )
@@ -152,6 +173,7 @@ def part(model: Model, vertices: Array) -> Model:
     number = np.full(model.wearer.template.shape[-1], -1)
     number[vertices] = np.arange(len(vertices))
     faces = number[np.asarray(model.faces)]
+    model = _feeling_itself(model)
     network = model.network._replace(
         shapes=_rows(model.network)[:, :, vertices].reshape(len(model.network.shapes), -1),
         weights=model.network.weights[:, vertices],
@@ -161,6 +183,18 @@ def part(model: Model, vertices: Array) -> Model:
         network=network,
         wearer=model.wearer._replace(template=model.wearer.template[..., vertices]),
         faces=jnp.asarray(faces[(faces >= 0).all(axis=1)]),
+    )
+
+
+def _feeling_itself(model: Model) -> Model:
+    """Return a model that feels the forces on the garment which is now shown, whatever is shown later."""
+    predictor, cloth = model.network.predictor, model.wearer.cloth
+    if isinstance(predictor, PosePredictor) or cloth is None or predictor.felt is not None:
+        return model
+    predictor = predictor._replace(felt=Shown(model.network.shapes, model.network.weights))
+    cloth = cloth._replace(template=model.wearer.template)
+    return dataclasses.replace(
+        model, network=model.network._replace(predictor=predictor), wearer=model.wearer._replace(cloth=cloth)
     )
 
 
@@ -186,6 +220,7 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     corners = np.asarray(_rows(model.network))[:, :, faces[face]]
     shapes = np.einsum("kcvi,vi->kcv", corners, weights)
     shapes[:, :, np.asarray(garment.pinned)] = 0.0
+    model = _feeling_itself(model)
     network = model.network._replace(
         shapes=jnp.asarray(shapes.reshape(len(shapes), -1)),
         weights=jnp.asarray(garment.weights).T[np.array(model.moving)],
@@ -229,11 +264,19 @@ def _rows(network: Network) -> Array:
 
 def _fewer_shapes(model: Model, count: int) -> Model:
     """Replace the blend shapes by principal components of ordinary displacements; their mean goes into the template."""
-    mix, shapes, mean = principal_rows(ordinary_weights(model), np.asarray(model.network.shapes), count)
-    network = model.network._replace(shapes=jnp.asarray(shapes))
-    template = model.wearer.template + jnp.asarray(mean).reshape(3, -1)
+    network, wearer, cloth = model.network, model.wearer, model.wearer.cloth
+    felt = network.predictor.felt if isinstance(network.predictor, ForcePredictor) else None
+    all_shapes = [np.asarray(x) for x in ([network.shapes] if felt is None else [network.shapes, felt.shapes])]
+    mix, rows, mean = principal_rows(ordinary_weights(model), np.concatenate(all_shapes, axis=1), count)
+    size = all_shapes[0].shape[1]
+    if felt is not None and cloth is not None:
+        felt = felt._replace(shapes=jnp.asarray(rows[:, size:]))
+        network = network._replace(predictor=network.predictor._replace(felt=felt))
+        wearer = wearer._replace(cloth=cloth._replace(template=cloth.template + mean[size:].reshape(3, -1)))
+    network = network._replace(shapes=jnp.asarray(rows[:, :size]))
+    wearer = wearer._replace(template=wearer.template + jnp.asarray(mean[:size]).reshape(3, -1))
     network = network._replace(mix=mix) if model.config.model.blendshape_relu else _mixed(network, mix)
-    return dataclasses.replace(model, network=network, wearer=model.wearer._replace(template=template))
+    return dataclasses.replace(model, network=network, wearer=wearer)
 
 
 def principal_rows(weights: np.ndarray, shapes: np.ndarray, count: int) -> tuple[Layer, np.ndarray, np.ndarray]:
@@ -285,10 +328,17 @@ def _fewer_influences(model: Model, count: int) -> Model:
 
 
 def _without_idle_joints(model: Model) -> Model:
-    weights = np.asarray(model.network.weights)
-    busy = weights.any(axis=1)
+    network, predictor = model.network, model.network.predictor
+    forced = isinstance(predictor, ForcePredictor)
+    moved = [network.weights]
+    if forced:
+        moved += [predictor.body] if predictor.felt is None else [predictor.body, predictor.felt.weights]
+    busy = np.any([np.asarray(weights).any(axis=1) for weights in moved], axis=0)
+    if forced:
+        felt = None if predictor.felt is None else predictor.felt._replace(weights=predictor.felt.weights[busy])
+        predictor = predictor._replace(body=predictor.body[busy], felt=felt)
     return dataclasses.replace(
         model,
-        network=model.network._replace(weights=jnp.asarray(weights[busy])),
+        network=network._replace(weights=network.weights[busy], predictor=predictor),
         moving=tuple(int(joint) for joint in np.array(model.moving)[busy]),
     )

@@ -2,7 +2,8 @@
 
 A packed model is a folder with `model.npz` and `config.yaml`; a `report.json` may say how it was trained. Large
 matrices are stored in eight bits with a scale for each column (`NAME` and `NAME|scale`). The blend shapes and the
-preconditioner are in half precision, all else as it is.
+preconditioner are in half precision, all else as it is. The whitening of a Psi with forces is the preconditioner's
+root, which needs all of its bits.
 """
 
 import json
@@ -15,13 +16,15 @@ import yaml
 
 from clothjax.config import Config
 from clothjax.files import checkpoint, configuration, damage, storage
+from clothjax.networks import forces
 from clothjax.networks.normalisation import ForceScales, Normalizers, Scale, Statistics, Whitening, identity
 from clothjax.types import Material
 
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
-HALVED = ("phi/garment/blendshapes", "phi/inverse_hessian")  # eight bits would strain the cloth, slow the descent
+HESSIAN, CANDIDATES = "phi/inverse_hessian", "normalizers/candidates"
+HALVED = ("phi/garment/blendshapes", HESSIAN)  # eight bits would strain the cloth, slow the descent
 FORMAT = 2  # of a packed model; 1 is the same without a number
 LARGE = 2000  # entries from which a matrix is stored in eight bits
 
@@ -142,10 +145,10 @@ def pack(run: str | Path, out: str | Path) -> int:
     """
     config, model = phi(run)
     student = psi(run)
-    if isinstance(student.normalizers, ForceScales):
-        raise ValueError(f"{run}: a Psi with forces cannot be packed yet; `clothjax evaluate` measures its run")
     for stage in STAGES:
         wanted = getattr(config, stage).steps
+        if stage == "stage2" and config.stage2.forces:
+            wanted = config.labels.rounds * config.labels.steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
         if done != wanted:
             raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
@@ -157,24 +160,32 @@ def pack(run: str | Path, out: str | Path) -> int:
     return write(out, config, model, student.predictor, student.normalizers)
 
 
-def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalizers: Normalizers) -> int:
+def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalizers: Normalizers | ForceScales) -> int:
     """Write a packed model; return the bytes of its weights.
 
     Args:
         phi: its `params` and `statistics`.
         predictor: parameters of the latent predictor.
-        normalizers: scales of its codes and pose inputs.
+        normalizers: scales of its codes and inputs.
     """
+    exact, scales = {CANDIDATES}, normalizers._asdict()
+    if isinstance(normalizers, ForceScales):
+        del scales["whitening"]  # of the inverse Hessian, which must then be exact
+        exact.add(HESSIAN)
+    else:
+        scales = {name: each._asdict() for name, each in scales.items()}
     parts = {
         "phi": phi["params"],
         "statistics": {name: each._asdict() for name, each in phi["statistics"].items()},
         "predictor": predictor,
-        "normalizers": {name: each._asdict() for name, each in normalizers._asdict().items()},
+        "normalizers": scales,
     }
     arrays: dict[str, Any] = {"format": np.int32(FORMAT)}
     for name, leaf in checkpoint.named(parts).items():
         leaf = np.asarray(leaf)
-        if name in HALVED:
+        if name in exact:
+            pass
+        elif name in HALVED:
             leaf = leaf.astype(np.float16)
         elif leaf.ndim > 1 and leaf.size > LARGE:
             scale = np.maximum(np.abs(leaf).max(axis=tuple(range(leaf.ndim - 1))) / 127, 1e-20).astype(np.float32)
@@ -223,9 +234,11 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
             leaves = {name: file[name] for name in names}
             for name, leaf in leaves.items():
                 scale = file[f"{name}|scale"] if leaf.dtype == np.int8 else 1
-                leaves[name] = (leaf * scale).astype(np.float32)
+                leaves[name] = leaf if name == CANDIDATES else (leaf * scale).astype(np.float32)
         tree = checkpoint.nested(leaves)
         tree["phi"]["garment"]  # all else of a model needs it
+        if config.stage2.forces:
+            tree["normalizers"]["whitening"] = forces.whitening(tree["phi"]["inverse_hessian"])._asdict()
         return config, {
             "phi": tree["phi"],
             "predictor": tree["predictor"],

@@ -8,7 +8,7 @@ import numpy as np
 
 from clothjax.body import rotation, skinning
 from clothjax.config import PhysicsConfig
-from clothjax.physics import energies
+from clothjax.physics import contact_search, energies
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array, Material, Pose, Rest
 
@@ -66,11 +66,7 @@ def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Ar
     Rest measures and areas are weighted by the garment's cloth.
     """
     template = skinning.shaped_vertices(scene.garment, betas)
-    measured = template if config.shaped_rest else jnp.asarray(scene.garment.vertices)
-    rest = energies.rest_measures(measured, scene.mesh)
-    areas = energies.vertex_areas(measured, scene.garment.faces)
-    if scene.garment.cloth is not None:
-        rest, areas = energies.regional(rest, areas, scene.mesh, jnp.asarray(scene.garment.cloth))
+    rest, areas = energies.cloth_measures(scene.garment, template if config.shaped_rest else None, scene.mesh)
     return (
         template,
         skinning.shaped_vertices(scene.body, betas),
@@ -118,6 +114,11 @@ def window(scene: Scene, character: Character, poses: Pose) -> Window:
         return jax.tree.map(lambda x: x[index], frames)
 
     return Window(at(0), at(1), at(2))
+
+
+def surface(scene: Scene, frame: Frame) -> tuple[Array, Array] | None:
+    """Return centroids [F, 3] m and unit normals [F, 3] of the body's faces at a frame; None without a body."""
+    return contact_search.centroids(frame.body, jnp.asarray(scene.body.faces)) if scene.touchable else None
 
 
 def skinned(character: Character, frame: Frame) -> Array:

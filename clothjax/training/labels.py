@@ -29,6 +29,7 @@ NOISY = 0.2  # share of the frames whose code gets noise
 WILD = (2.0, 0.2)  # a code of Psi's with more energy than so often the held one's, plus so many J, is not followed
 LOST = 200.0  # J, from which on a frame is left out
 ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertices
+STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
 PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
 
 
@@ -81,7 +82,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
 
     def segment(one: tuple[Array, Simulation], policy: Policy, clips: Clips) -> Round:
         key, simulation = one
-        share_key, noise_key, external_key, new_key, renew_key = jax.random.split(key, 5)
+        share_key, noise_key, external_key, new_key, renew_key, still_key = jax.random.split(key, 6)
         character = pool.dressed(scene, simulation.betas, simulation.material, config)
         constants = psi.constant_inputs(character.betas, character.material, config.material)
         scales = policy.scales
@@ -104,7 +105,8 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             def potential(new: Array) -> Array:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
-            pulls = forces.reduced(garment, held, step, window, scene, scales.candidates, config.physics)
+            surface = characters.surface(scene, window.following)
+            pulls = forces.reduced(garment, held, step, surface, scales.candidates, scene.mesh, config.physics)
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code])
@@ -128,7 +130,13 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             state = ClothState(new, velocity, velocity - state.velocity, taken, taken - held)
             return rollout.follow(state, poses.translation[2]), labels
 
-        poses = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
+        still = jax.random.uniform(still_key) < STILL
+        windows = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
+        stood = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (settings.frames, *x.shape)),
+            motion_clips.standing(motion_clips.poses(clips, simulation.frame)),
+        )
+        poses = jax.tree.map(lambda x, y: jnp.where(still, x, y), stood, windows)
         keys = jax.random.split(noise_key, settings.frames)
         cloth, labels = jax.lax.scan(frame, simulation.cloth, (poses, keys))
         goes_on = (
@@ -136,7 +144,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             & (clips.remaining[simulation.frame] > 2 * settings.frames)
             & (jax.random.uniform(renew_key) > settings.renewed)
         )
-        later = simulation._replace(cloth=cloth, frame=simulation.frame + settings.frames)
+        later = simulation._replace(cloth=cloth, frame=simulation.frame + jnp.where(still, 0, settings.frames))
         new = pool.begin(new_key, scene, clips, config)
         return Round(jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), later, new), labels)
 

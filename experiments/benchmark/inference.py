@@ -300,7 +300,7 @@ def given_features(model: Model, path: Path, *, int8: bool, skinned: bool = True
         skinned: with blend shapes and skinning; else to the weights of the shapes.
     """
     g, network = Graph(int8), model.network
-    count, size, vertices = len(network.pose_mean), len(network.first), model.wearer.template.shape[1]
+    count, size, vertices = len(network.predictor.pose_mean), len(network.first), model.wearer.template.shape[1]
     inputs, outputs = {"inputs": (1, count), "latent": (1, size)}, {"next_latent": (1, size)}
     latent, _ = onnx.predicted(g, "inputs", model, np.arange(count))
     if skinned:

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clothjax.body import motion_clips
+from clothjax.body import motion_clips, reach
 from clothjax.config import Config
 from clothjax.evaluation import metrics, pictures, rollouts
 from clothjax.evaluation import report as measures
 from clothjax.files import checkpoint
 from clothjax.networks import normalisation
 from clothjax.runtime import models, trained
-from clothjax.simulation import assembly, scene
+from clothjax.simulation import assembly
 from clothjax.training import pipeline
 from clothjax.types import Motion
 from experiments import evaluate, gallery, quickstart, render, tune
@@ -278,7 +278,7 @@ def test_a_garment_elsewhere_is_refused():
     experiment = assembly.assemble(Config())
     far = experiment.garment._replace(vertices=experiment.garment.vertices + 5)
     with pytest.raises(ValueError, match="no part of the body is within"):
-        scene.reachable(experiment.body, far, 0.35)
+        reach.reachable(experiment.body, far, 0.35)
 
 
 def test_statistics_are_those_of_all_rows_counted():

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 from samples import ROOT, apart, random_model
 from toy import small
 
@@ -252,12 +253,23 @@ def test_safetensors_hold_the_whole_model(model, motion, tmp_path, monkeypatch):
         path = safetensors.to_safetensors(each, tmp_path / "g.safetensors")
         again = safetensors.from_safetensors(path)
         np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(each, motion)[0])
-    with monkeypatch.context() as older, pytest.raises(ValueError, match=r"has format 1, .* reads up to 0; update it"):
-        older.setattr(safetensors, "FORMAT", 0)
+    with monkeypatch.context() as older, pytest.raises(ValueError, match=r"has format 2, .* reads up to 1; update it"):
+        older.setattr(safetensors, "FORMAT", 1)
         safetensors.from_safetensors(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"g\.safetensors: not a whole model in safetensors .*convert it again"):
         safetensors.from_safetensors(path)
+
+
+def test_safetensors_of_format_1_are_read(model, motion, tmp_path):
+    """Where the arrays of the latent predictor stood beside the others."""
+    path = safetensors.to_safetensors(model, tmp_path / "new.safetensors")
+    with safetensors._library().safe_open(str(path), framework="numpy") as file:
+        arrays = {name.replace(".predictor", ""): file.get_tensor(name) for name in sorted(file.keys())}
+        about = {name: value for name, value in file.metadata().items() if name != "format"} | {"format": "1"}
+    save_file(arrays, str(tmp_path / "old.safetensors"), metadata=about)
+    again = safetensors.from_safetensors(tmp_path / "old.safetensors")
+    np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(model, motion)[0])
 
 
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):

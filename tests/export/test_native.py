@@ -30,7 +30,7 @@ def library(tmp_path_factory):
 
 def rounded(model):
     """The model with the matrices that a .psi has."""
-    network = model.network
+    network, predictor = model.network, model.network.predictor
 
     def eight(kernel, even=False):
         matrix, gain, scale = native.eight_bits(kernel, even)
@@ -42,9 +42,11 @@ def rounded(model):
     return dataclasses.replace(
         model,
         network=network._replace(
-            pose=eight(network.pose, True),
-            code=layer(network.code),
-            hidden=tuple(map(layer, network.hidden)),
+            predictor=predictor._replace(
+                pose=eight(predictor.pose, True),
+                code=layer(predictor.code),
+                hidden=tuple(map(layer, predictor.hidden)),
+            ),
             read=layer(network.read, True),
             decoder=tuple(map(layer, network.decoder)),
             mix=layer(network.mix),

@@ -150,7 +150,7 @@ def test_the_state_says_nothing_of_the_frames_before_the_last_two(trained):
     model, motion, *_ = trained
     pose = Pose(jnp.asarray(motion.rotations[3]), jnp.asarray(motion.translation[3]))
     state = inference.initial_state(model, pose)
-    size = sum(x.size for x in state)
+    size = sum(x.size for x in jax.tree.leaves(state))
     joints = motion.rotations.shape[1]
     assert size == state.latent.size + 2 * (9 * joints + 3 * joints + 3) + 1
 

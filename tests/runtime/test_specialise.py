@@ -51,7 +51,7 @@ def test_a_folded_code_is_held_to_what_its_range_becomes(wide, motion):
     narrow = narrow._replace(low=0 * narrow.low - 0.01, high=0 * narrow.high + 0.01)
     model = dataclasses.replace(wide, network=wide.network._replace(code_bounds=narrow))
     folded = specialise.specialise(model)
-    readers = np.concatenate([wide.network.code.kernel, wide.network.read.kernel], axis=1)
+    readers = np.concatenate([wide.network.predictor.code.kernel, wide.network.read.kernel], axis=1)
     np.testing.assert_allclose(folded.network.code_bounds.high, 0.01 * np.abs(readers).sum(axis=0), rtol=1e-4)
     vertices, _ = inference.animate(folded, motion)
     assert np.isfinite(vertices).all()
@@ -60,7 +60,7 @@ def test_a_folded_code_is_held_to_what_its_range_becomes(wide, motion):
 def test_a_code_as_wide_as_its_readers_stays():
     model = cj.load("tshirt")
     folded = specialise.specialise(model)
-    assert folded.network.code.kernel is not None
+    assert folded.network.predictor.code.kernel is not None
     # no finger and no foot moves a t-shirt
     assert (
         len(folded.moving) < len(model.moving)

@@ -10,7 +10,7 @@ import pytest
 from toy import assert_same, small
 
 from clothjax.body import motion_clips
-from clothjax.config import LabelsConfig
+from clothjax.config import LabelsConfig, PhysicsConfig
 from clothjax.evaluation import report
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import contact_search, descent, incremental_potential
@@ -56,6 +56,11 @@ def problem(toy):
     return scene, config, lambda z: garment(latent=z), step, window, code
 
 
+def reduced(garment, code, step, window, scene, candidates):
+    surface = characters.surface(scene, window.following)
+    return forces.reduced(garment, code, step, surface, candidates, scene.mesh, PhysicsConfig())
+
+
 def all_faces(scene):
     return np.broadcast_to(np.arange(len(scene.body.faces)), (len(scene.garment.vertices), len(scene.body.faces)))
 
@@ -63,7 +68,7 @@ def all_faces(scene):
 def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem):
     """Of all terms but friction and contact of edges; with all faces as candidates, contact is HOOD's."""
     scene, config, garment, step, window, code = problem
-    kinds = forces.reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)), config.physics)
+    kinds = reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)))
     body = window.following.body
     planes = contact_search.find_at_centroids(garment(code), body, body, scene.body.faces)
     physics = dataclasses.replace(config.physics, without=("friction", "edge_collision"))
@@ -77,10 +82,10 @@ def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem):
 
 
 def test_a_vertex_feels_only_its_candidates(problem):
-    scene, _, garment, step, window, code = problem
+    scene, _, garment, _, window, code = problem
     held, body, faces = garment(code), window.following.body, jnp.asarray(scene.body.faces)
     far = jnp.argmax(jnp.linalg.norm(held[:, None] - contact_search.centroids(body, faces)[0][None], axis=-1), axis=1)
-    contact = forces.felt(step, held, body, faces, far[:, None].astype(jnp.int32)).contact
+    contact = forces.felt(held, contact_search.centroids(body, faces), far[:, None].astype(jnp.int32))
     np.testing.assert_array_equal(contact.point_next, contact_search.centroids(body, faces)[0][far])
 
 
@@ -199,7 +204,7 @@ def test_a_simulation_that_is_pushed_feels_it(toy, monkeypatch):
     def momentum(external):
         step = time_step.time_step(scene, character, simulation.cloth, window, 1 / config.fps, config, external)
         held, near = simulation.cloth.latent, blank.normalizers.candidates
-        return forces.reduced(lambda z: garment(latent=z), held, step, window, scene, near, config.physics)[0]
+        return reduced(lambda z: garment(latent=z), held, step, window, scene, near)[0]
 
     expected = momentum(push)
     np.testing.assert_allclose(pushed.forces[0, 0], expected, atol=1e-3 * float(jnp.abs(expected).max()))

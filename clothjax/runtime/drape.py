@@ -1,0 +1,136 @@
+"""The garment of a model: decoded, skinned, and, for a Psi with forces, felt (METHOD.md, Psi with forces).
+
+Garments are [3, V], coordinate by coordinate, because processors are fast at long rows.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from clothjax.config import Config
+from clothjax.networks import forces, psi
+from clothjax.physics import contact_search
+from clothjax.physics.incremental_potential import TimeStep
+from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network, Shown
+from clothjax.types import Array, Pose
+
+HIGHEST = jax.lax.Precision.HIGHEST
+
+
+def blend_weights(network: Network, latent: Array, config: Config) -> Array:
+    """Return the weights [K] of the blend shapes `Network.shapes` for a code [C]."""
+    read = network.read
+    product = latent @ read.kernel if isinstance(read, Layer) else latent[-len(read.bias) :]
+    x, skip = jnp.split(read.bias + product, [network.width])
+    for layer in network.decoder:
+        x = jax.nn.relu(x) @ layer.kernel + layer.bias
+    weights = x + skip if config.model.decoder_skip else x
+    weights = jax.nn.relu(weights) if config.model.blendshape_relu else weights
+    return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
+
+
+def shown(model: Model, latent: Array, drape: Drape | None, transforms: Array) -> Array:
+    """Return the vertices [V, 3] m that are shown, relative to the root's translation.
+
+    Args:
+        latent: [C].
+        drape: after the step, of a Psi with forces; what it feels is often what is shown.
+        transforms: [J', 3, 4] of the joints.
+    """
+    if drape is not None and _forces(model).felt is None:
+        return drape.position
+    garment = _canonical(model, latent, Shown(model.network.shapes, model.network.weights), model.wearer.template)
+    return _skin(_rows(model.network.weights, transforms), garment).T
+
+
+def begin(model: Model, latent: Array, transforms: Array) -> Drape:
+    """Return how the garment of a Psi with forces hangs for a code [L], at rest; arguments as of `shown`."""
+    felt, template = _felt(model)
+    garment = _canonical(model, latent, felt, template)
+    position = _skin(_rows(felt.weights, transforms), garment).T
+    return Drape(jnp.zeros_like(latent), garment, position, jnp.zeros_like(position))
+
+
+def predict(
+    model: Model, latent: Array, drape: Drape, transforms: Array, pose: Pose, advance: Array, external: Array | None
+) -> Array:
+    """Return the next code [L], not yet clipped, from the forces on the held garment at the next frame.
+
+    Args:
+        latent, drape: of the current frame.
+        transforms: [J', 3, 4] of the joints at the next frame.
+        pose: of the next frame.
+        advance: [3] m, the root's step to it.
+        external: [3] m/s^2 or None, as of `inference.step`.
+    """
+    parts, cloth, config = _forces(model), model.wearer.cloth, model.config
+    assert cloth is not None
+    felt, _ = _felt(model)
+    rows, timestep = _rows(felt.weights, transforms), 1.0 / config.fps
+    held = (_skin(rows, drape.garment) + advance[:, None]).T
+    body = cloth.body
+    if parts.corrections is not None:
+        turned = (pose.rotations[1:] - jnp.eye(3)[None]).reshape(-1)
+        body += jnp.einsum("ncp,p->nc", parts.corrections, turned, precision=HIGHEST)
+    posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
+    step = TimeStep(
+        position=drape.position,
+        velocity=drape.velocity if external is None else drape.velocity + timestep**2 * external[None],
+        mass=cloth.mass,
+        rest=cloth.rest,
+        material=cloth.material,
+        contact=None,
+        touching=None,
+        timestep=jnp.float32(timestep),
+    )
+    surface = contact_search.centroids(posed, parts.faces)
+    on_vertices = forces.on_vertices(held, step, surface, parts.scales.candidates, parts.mesh, config.physics)
+    carried_back = jnp.einsum("abv,kva->kbv", rows[:, :3], on_vertices, precision=HIGHEST)
+    on_weights = jnp.matmul(carried_back.reshape(len(forces.KINDS), -1), felt.shapes.T, precision=HIGHEST)
+    _, pullback = jax.vjp(lambda code: blend_weights(model.network, code, config), latent)
+    pulls = jax.vmap(lambda force: pullback(force)[0])(on_weights)
+    return psi.next_code(parts.params, parts.scales, latent, drape.change, pulls, cloth.constants, config.stage2)
+
+
+def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms: Array, advance: Array) -> Drape:
+    """Return how the garment hangs after a step, relative to the root's new translation.
+
+    Args:
+        latent, before: [L] the new code and the one before it.
+        drape: before the step.
+        transforms, advance: as of `predict`.
+    """
+    felt, template = _felt(model)
+    garment = _canonical(model, latent, felt, template)
+    position = _skin(_rows(felt.weights, transforms), garment).T
+    return Drape(latent - before, garment, position, position + advance[None] - drape.position)
+
+
+def _forces(model: Model) -> ForcePredictor:
+    assert isinstance(model.network.predictor, ForcePredictor)
+    return model.network.predictor
+
+
+def _felt(model: Model) -> tuple[Shown, Array]:
+    """Return the garment that feels, and its template [3, V] m."""
+    felt, cloth = _forces(model).felt, model.wearer.cloth
+    if felt is None:
+        return Shown(model.network.shapes, model.network.weights), model.wearer.template
+    assert cloth is not None and cloth.template is not None
+    return felt, cloth.template
+
+
+def _canonical(model: Model, latent: Array, garment: Shown, template: Array) -> Array:
+    """Return a garment [3, V] m in the canonical pose, for a code [C] and its template [3, V] m."""
+    weights = blend_weights(model.network, latent, model.config)
+    return template + jnp.matmul(weights, garment.shapes, precision=HIGHEST).reshape(3, -1)
+
+
+def _rows(weights: Array, transforms: Array) -> Array:
+    """Return the transforms [3, 4, V] of vertices with weights [J', V], from those [J', 3, 4] of the joints."""
+    return jnp.matmul(transforms.reshape(-1, 12).T, weights, precision=HIGHEST).reshape(3, 4, -1)
+
+
+def _skin(rows: Array, garment: Array) -> Array:
+    """Return a garment [3, V] m, moved by the transforms [3, 4, V] of its vertices."""
+    x, y, z = (rows[:, i] * garment[None, i] for i in range(3))
+    return x + y + z + rows[:, 3]
