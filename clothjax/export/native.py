@@ -11,15 +11,20 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import sidecar
-from clothjax.runtime.models import Bounds, FoldedLayer, Layer, Model
+from clothjax.networks import psi
+from clothjax.networks.forces import KINDS
+from clothjax.networks.psi import BOUND
+from clothjax.physics.energies import GRAVITY, THICKNESS
+from clothjax.runtime.models import Bounds, FoldedLayer, ForcePredictor, Layer, Model, Shown
 from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
-VERSION = 1
+VERSION = 1  # of a model without forces; one with forces has 2
 ALIGN = 64
 LANES = 64  # vertices skinned at once
 FLAGS = ("-O3", "-march=native")
@@ -48,26 +53,28 @@ def packed(model: Model) -> bytes:
 def _arrays(model: Model) -> Iterator[np.ndarray]:
     """Yield the arrays of a file in their order."""
     network, wearer, predictor = model.network, model.wearer, model.network.predictor
-    code = len(network.first)
+    code, forced = len(network.first), isinstance(predictor, ForcePredictor)
+    hidden = _mlp(predictor)[1:] if forced else predictor.hidden
     head = (
-        MAGIC, VERSION, len(model.parents), len(model.input_joints), len(model.moving), wearer.template.shape[1], code,
-        len(predictor.hidden), len(network.decoder), len(network.read.bias) > network.width,
-        model.config.model.blendshape_relu, network.mix is not None, bool(wearer.known), 0, 0, 0,
+        MAGIC, VERSION + forced, len(model.parents), len(model.input_joints), len(model.moving),
+        wearer.template.shape[1], code, len(hidden), len(network.decoder), len(network.read.bias) > network.width,
+        model.config.model.blendshape_relu, network.mix is not None, bool(wearer.known), forced, 0, 0,
     )  # fmt: skip
     yield np.array(head, np.int32)
     yield np.array([model.config.fps, model.config.stage2.latent_decay], np.float32)
     for integers in (model.parents, model.input_joints, model.moving):
         yield np.array(integers, np.int32)
     yield np.asarray(wearer.joints, np.float32)
-    weights = np.asarray(network.weights, np.float32)
-    yield np.pad(weights, [(0, 0), (0, -weights.shape[1] % LANES)])
-    yield np.asarray(predictor.pose_mean, np.float32)
-    yield from _bounds(predictor.pose_bounds, len(predictor.pose_mean))
+    yield _padded(network.weights)
+    if not forced:
+        yield np.asarray(predictor.pose_mean, np.float32)
+        yield from _bounds(predictor.pose_bounds, len(predictor.pose_mean))
     yield from _bounds(network.code_bounds, code)
     yield np.asarray(network.first, np.float32)
-    yield from _layer(Layer(predictor.pose, predictor.code.bias + wearer.bias), gains=True)
-    yield from _layer(predictor.code._replace(bias=np.zeros(len(wearer.bias))))
-    for layer in predictor.hidden:
+    if not forced:
+        yield from _layer(Layer(predictor.pose, predictor.code.bias + wearer.bias), gains=True)
+        yield from _layer(predictor.code._replace(bias=np.zeros(len(wearer.bias))))
+    for layer in hidden:
         yield from _layer(layer)
     yield from _layer(network.read, gains=True)
     for layer in network.decoder:
@@ -75,6 +82,94 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     if network.mix is not None:
         yield from _layer(network.mix)
     yield from _layer(Layer(network.shapes, wearer.template.reshape(-1)), gains=True)
+    if forced:
+        yield from _of_forces(model, predictor)
+
+
+def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
+    """Yield the arrays of a predictor with forces: cloth, body and candidates, then layers."""
+    network, cloth, physics = model.network, model.wearer.cloth, model.config.physics
+    assert cloth is not None
+    if predictor.corrections is not None:
+        raise ValueError("plain C has no pose blend shapes of a body yet; export to another format")
+    felt = predictor.felt or Shown(network.shapes, network.weights)
+    mesh, rest, scales = predictor.mesh, cloth.rest, predictor.scales
+    vertices, neighbours = scales.candidates.shape
+    yield np.array(
+        [vertices, len(mesh.faces), len(mesh.hinges), len(cloth.body), len(predictor.faces), neighbours,
+         predictor.felt is not None, 0],
+        np.int32,
+    )  # fmt: skip
+    weight = 0.0 if "gravity" in physics.without else GRAVITY
+    yield np.array([1 / model.config.fps, weight, physics.collision_stiffness, physics.collision_offset], np.float32)
+    size = np.asarray(rest.face_area) * THICKNESS
+    stiffness = 0.0 if "bending" in physics.without else np.asarray(cloth.material.bending)
+    yield _padded(cloth.mass)
+    yield _padded(mesh.faces.T)
+    yield _padded(np.asarray(rest.inverse).reshape(-1, 4).T)
+    yield _padded(2.0 * np.asarray(cloth.material.mu) * size)
+    yield _padded(np.asarray(cloth.material.lam) * size)
+    yield _padded(mesh.hinges.T)
+    yield _padded(stiffness / (4.0 * np.asarray(rest.hinge_area)))
+    yield _padded(rest.hinge_angle)
+    yield _padded(predictor.faces.T)
+    yield _padded(scales.candidates.T)
+    yield _padded(predictor.body)
+    yield _padded(cloth.body.T)
+    if predictor.felt is not None:
+        yield _padded(felt.weights)
+    read, code = network.read, len(network.first)
+    assert isinstance(read, Layer)
+    inputs = len(scales.middle) - len(cloth.constants)
+    spread = BOUND * np.asarray(scales.spread, np.float64)
+    yield np.asarray(scales.middle[:inputs], np.float32)
+    yield np.asarray(1.0 / spread[:inputs], np.float32)
+    yield from _layer(_linear(_rest(read.kernel)), gains=True)
+    yield from _layer(_linear(np.asarray(felt.shapes).T))
+    for layer in ([] if network.mix is None else [network.mix]) + list(network.decoder):
+        yield from _layer(_linear(np.asarray(layer.kernel).T))
+    back = np.asarray(scales.whitening.back, np.float64)
+    yield from _exact(np.asarray(read.kernel, np.float64).T @ back)
+    yield from _exact(scales.whitening.to)
+    linear = predictor.params["linear"]
+    first = _mlp(predictor)[0]
+    kernel = np.concatenate([first.kernel, linear["kernel"]], axis=1).astype(np.float64)
+    constants = np.asarray(psi.scaled_inputs(scales, jnp.pad(cloth.constants, (inputs, 0))))[inputs:]
+    bias = np.concatenate([first.bias, linear["bias"]]) + constants @ kernel[inputs:]
+    yield from _layer(Layer(kernel[:inputs], bias))
+    yield from _exact(np.asarray(scales.output) * back)
+    if predictor.felt is not None:
+        assert cloth.template is not None
+        yield from _layer(Layer(felt.shapes, cloth.template.reshape(-1)), gains=True)
+    assert inputs == (2 + len(KINDS)) * code
+
+
+def _mlp(predictor: ForcePredictor) -> list[Layer]:
+    layers = predictor.params["mlp"]
+    return [Layer(layers[f"dense_{i}"]["kernel"], layers[f"dense_{i}"]["bias"]) for i in range(len(layers))]
+
+
+def _padded(rows: Array) -> np.ndarray:
+    """Return rows [..., N] that go on with zeros to a multiple of `LANES`; reals are float32, integers int32."""
+    rows = np.asarray(rows)
+    rows = rows.astype(np.int32 if np.issubdtype(rows.dtype, np.integer) else np.float32)
+    return np.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, -rows.shape[-1] % LANES)])
+
+
+def _linear(kernel: Array) -> Layer:
+    return Layer(kernel, np.zeros(kernel.shape[1]))
+
+
+def _exact(kernel: Array) -> Iterator[np.ndarray]:
+    """Yield a kernel as two layers: the second is the `_rest` of the first."""
+    yield from _layer(_linear(kernel), gains=True)
+    yield from _layer(_linear(_rest(kernel)), gains=True)
+
+
+def _rest(kernel: Array) -> np.ndarray:
+    """Return what eight bits with gains leave of a kernel."""
+    eight, gain, scale = eight_bits(kernel, True)
+    return np.asarray(kernel, np.float64) - (scale[:, None] * eight * gain).T
 
 
 def _bounds(bounds: Bounds, size: int) -> Iterator[np.ndarray]:

@@ -13,8 +13,13 @@
 #define MOST_JOINTS 1024
 #define MOST_WIDTH 65536  /* inputs of a layer: their sums have room in 32 bits */
 #define MOST_HIDDEN 16
+#define MOST_ELEMENTS (1 << 20)
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
+#define KINDS 3           /* of forces: momentum, elasticity, contact */
+#define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
+#define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
+#define SETTLING 60       /* frames that a garment with forces settles for before the first */
 
 typedef struct { /* y = bias + scale * (weights (gain * x)); without inputs the bias alone */
     int32_t inputs, outputs, stride;
@@ -26,8 +31,31 @@ typedef struct {
     const float *low, *high, *slack;
 } bounds;
 
+typedef struct { /* a square matrix in sixteen bits: the rest of the first is in the second */
+    layer coarse, fine;
+} exact;
+
+typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
+    int32_t vertices, triangles, hinges, body, faces, candidates;
+    float timestep, gravity, stiffness, offset;
+    const float *mass;                                /* [vertices] */
+    const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
+    const float *inverse, *shear, *trace;             /* [4][triangles], [triangles], [triangles] */
+    const float *bend, *angle;                        /* [hinges] */
+    const int32_t *face, *candidate;                  /* [3][faces], [candidates][vertices] */
+    const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
+    const float *weight;                              /* [moving][vertices] */
+    const float *middle, *inverse_spread;             /* of the inputs [(2 + KINDS) code], over BOUND */
+    layer unshape, unmix, undecode[MOST_HIDDEN], first; /* transposed shapes, mix, layers of the decoder */
+    layer read_fine;                                  /* the rest of the decoder's first, in sixteen bits */
+    layer felt_shapes;                                /* of the garment that feels, if it is not the one shown */
+    exact unread, change, move;
+} forces;
+
 struct psi_model {
     void *file;
+    int32_t forced, apart; /* with forces; with a garment that feels apart from the one that is shown */
+    forces f;
     int32_t joints, kept, moving, vertices, code, hidden, decoder, skip, relu, mixed, known;
     float fps, decay;
     const int32_t *parent, *input, *bone;
@@ -43,7 +71,12 @@ struct psi_state {
     float *rotations, *positions, *translation;  /* [3][joints][9], [3][joints][3], [3][3], newest first */
     float *global, *skinning;                    /* rotations [joints][9]; matrices [moving][12] */
     float *inputs, *rows[3];
-    int16_t *fixed; /* inputs of a layer in fixed point */
+    int16_t *fixed; /* inputs of layers in fixed point */
+    /* with forces, rows [vertices, to a multiple of LANES] */
+    float external[3];
+    float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
+    float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
+    float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
 
 /* reading */
@@ -107,16 +140,47 @@ static bounds read_bounds(reader *r, int32_t count) {
     return b;
 }
 
-/* Whether every layer takes what there is for it. */
-static int fits(const psi_model *m) {
-    int32_t width = m->pose.outputs, wide = m->decoder ? m->decode[0].inputs : 0, shapes;
-    int good = m->hidden > 0 && m->decoder > 0 && m->pose.inputs == 6 + 18 * m->kept + 9 * (m->kept - 1);
-    good &= m->previous.outputs == width && (m->previous.inputs ? m->previous.inputs == m->code : width <= m->code);
+static int takes(const layer *l, int32_t inputs, int32_t outputs) { return l->inputs == inputs && l->outputs == outputs; }
+
+static int takes_exact(const exact *e, int32_t inputs, int32_t outputs) {
+    return takes(&e->coarse, inputs, outputs) && takes(&e->fine, inputs, outputs);
+}
+
+/* Whether every layer of a predictor with forces takes what there is for it. */
+static int fits_forces(const psi_model *m) {
+    const forces *f = &m->f;
+    const int32_t code = m->code, last = m->decode[m->decoder - 1].outputs;
+    int good = takes(&f->read_fine, code, m->read.outputs);
+    good &= takes(&f->unshape, 3 * f->vertices, m->shapes.inputs) && (!m->mixed || takes(&f->unmix, m->mix.outputs, last));
+    for (int32_t i = 0; i < m->decoder; i++)
+        good &= takes(&f->undecode[i], m->decode[i].outputs, m->decode[i].inputs);
+    good &= takes_exact(&f->unread, m->read.outputs, code) && takes_exact(&f->change, code, code) &&
+            takes_exact(&f->move, code, code);
+    int32_t width = f->first.outputs - code;
+    good &= f->first.inputs == (2 + KINDS) * code && width > 0;
     for (int32_t i = 0; i < m->hidden; i++) {
         good &= m->then[i].inputs == width;
         width = m->then[i].outputs;
     }
-    good &= width == m->code && (m->read.inputs ? m->read.inputs == m->code : m->read.outputs <= m->code);
+    return good && width == code && (m->apart ? takes(&f->felt_shapes, m->shapes.inputs, 3 * f->vertices) : f->vertices == m->vertices);
+}
+
+/* Whether every layer takes what there is for it. */
+static int fits(const psi_model *m) {
+    int32_t width = m->pose.outputs, wide = m->decoder ? m->decode[0].inputs : 0, shapes;
+    int good = m->hidden > 0 && m->decoder > 0;
+    if (m->forced) {
+        good = good && fits_forces(m);
+    } else {
+        good &= m->pose.inputs == 6 + 18 * m->kept + 9 * (m->kept - 1);
+        good &= m->previous.outputs == width && (m->previous.inputs ? m->previous.inputs == m->code : width <= m->code);
+        for (int32_t i = 0; i < m->hidden; i++) {
+            good &= m->then[i].inputs == width;
+            width = m->then[i].outputs;
+        }
+        good &= width == m->code;
+    }
+    good &= (m->read.inputs ? m->read.inputs == m->code : m->read.outputs <= m->code);
     width = wide;
     for (int32_t i = 0; i < m->decoder; i++) {
         good &= m->decode[i].inputs == width;
@@ -126,6 +190,54 @@ static int fits(const psi_model *m) {
     shapes = m->mixed ? m->mix.outputs : width;
     return good && (!m->mixed || m->mix.inputs == width) && m->shapes.inputs == shapes &&
            m->shapes.outputs == 3 * m->vertices;
+}
+
+static exact read_exact(reader *r, psi_model *m) {
+    exact e;
+    e.coarse = read_layer(r, m);
+    e.fine = read_layer(r, m);
+    return e;
+}
+
+static int32_t padded(int32_t count) { return (count + LANES - 1) / LANES * LANES; }
+
+static void read_forces(reader *r, psi_model *m) {
+    forces *f = &m->f;
+    const int32_t *head = integers(r, 8);
+    const float *rates = floats(r, 4);
+    if (!r->sound) return;
+    f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
+    f->triangles = within(r, head[1], 0, MOST_ELEMENTS);
+    f->hinges = within(r, head[2], 0, MOST_ELEMENTS);
+    f->body = within(r, head[3], 1, MOST_ELEMENTS);
+    f->faces = within(r, head[4], 1, MOST_ELEMENTS);
+    f->candidates = within(r, head[5], 1, 1024);
+    m->apart = head[6];
+    f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
+    f->mass = floats(r, padded(f->vertices));
+    f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
+    f->inverse = floats(r, 4 * (size_t)padded(f->triangles));
+    f->shear = floats(r, padded(f->triangles));
+    f->trace = floats(r, padded(f->triangles));
+    f->hinge = indices(r, 4 * padded(f->hinges), f->vertices);
+    f->bend = floats(r, padded(f->hinges));
+    f->angle = floats(r, padded(f->hinges));
+    f->face = indices(r, 3 * padded(f->faces), f->body);
+    f->candidate = indices(r, f->candidates * padded(f->vertices), f->faces);
+    f->body_weight = floats(r, (size_t)m->moving * padded(f->body));
+    f->body_rest = floats(r, 3 * (size_t)padded(f->body));
+    f->weight = m->apart ? floats(r, (size_t)m->moving * padded(f->vertices)) : m->weight;
+    f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
+    f->inverse_spread = floats(r, (2 + KINDS) * (size_t)m->code);
+    f->read_fine = read_layer(r, m);
+    f->unshape = read_layer(r, m);
+    if (m->mixed) f->unmix = read_layer(r, m);
+    for (int32_t i = 0; i < m->decoder; i++) f->undecode[i] = read_layer(r, m);
+    f->unread = read_exact(r, m);
+    f->change = read_exact(r, m);
+    f->first = read_layer(r, m);
+    f->move = read_exact(r, m);
+    if (m->apart) f->felt_shapes = read_layer(r, m);
 }
 
 static void read_model(reader *r, psi_model *m) {
@@ -147,18 +259,20 @@ static void read_model(reader *r, psi_model *m) {
     m->bone = indices(r, m->moving, m->joints);
     m->rest = floats(r, 3 * (size_t)m->joints);
     m->weight = floats(r, (size_t)m->moving * ((m->vertices + LANES - 1) / LANES * LANES));
-    int32_t poses = 6 + 18 * m->kept + 9 * (m->kept - 1);
+    m->forced = head[13];
+    int32_t poses = m->forced ? 0 : 6 + 18 * m->kept + 9 * (m->kept - 1);
     m->pose_mean = floats(r, poses);
     m->pose_bounds = read_bounds(r, poses);
     m->code_bounds = read_bounds(r, m->code);
     m->start = floats(r, m->code);
-    m->pose = read_layer(r, m);
-    m->previous = read_layer(r, m);
+    if (!m->forced) m->pose = read_layer(r, m);
+    if (!m->forced) m->previous = read_layer(r, m);
     for (int32_t i = 0; i < m->hidden; i++) m->then[i] = read_layer(r, m);
     m->read = read_layer(r, m);
     for (int32_t i = 0; i < m->decoder; i++) m->decode[i] = read_layer(r, m);
     if (m->mixed) m->mix = read_layer(r, m);
     m->shapes = read_layer(r, m);
+    if (r->sound && m->forced) read_forces(r, m);
 }
 
 static uint8_t *aligned(void *memory) {
@@ -172,8 +286,10 @@ static psi_model *failed(psi_model *m, const char **error, const char *why) {
 }
 
 static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char **error) {
-    const int32_t version[2] = {0x00495350, 1}; /* "PSI" */
-    if (size < ALIGN || memcmp(bytes, version, sizeof version)) return failed(m, error, "not a .psi of this version");
+    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 2 */
+    int32_t version[2] = {0, 0};
+    if (size >= ALIGN) memcpy(version, bytes, sizeof version);
+    if (version[0] != name || version[1] < 1 || version[1] > 2) return failed(m, error, "not a .psi of this version");
     reader r = {bytes, size, 1};
     read_model(&r, m);
     if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
@@ -230,6 +346,12 @@ static float largest(const float *x, const float *gain, int32_t count) {
     return value;
 }
 
+static void quantise(const layer *l, const float *x, float inverse, int16_t *restrict q) {
+    for (int32_t i = 0; i < l->inputs; i++)
+        q[i] = (int16_t)((int32_t)(x[i] * l->gain[i] * inverse + 32768.5f) - 32768);
+    memset(q + l->inputs, 0, (l->stride - l->inputs) * sizeof *q);
+}
+
 /* A dense layer; its inputs in fixed point, of sixteen bits or as many as their sums have room for, which are exact. */
 static void dense(const layer *l, const float *x, float *restrict y, psi_state *s) {
     const float limit = largest(x, l->gain, l->inputs);
@@ -241,9 +363,7 @@ static void dense(const layer *l, const float *x, float *restrict y, psi_state *
     int16_t *restrict q = s->fixed;
     const int32_t room = INT32_MAX / (128 * stride), most = room < INT16_MAX ? room : INT16_MAX;
     const float step = limit / most, inverse = most / limit;
-    for (int32_t i = 0; i < l->inputs; i++)
-        q[i] = (int16_t)((int32_t)(x[i] * l->gain[i] * inverse + 32768.5f) - 32768);
-    memset(q + l->inputs, 0, (stride - l->inputs) * sizeof *q);
+    quantise(l, x, inverse, q);
     for (int32_t o = 0; o < l->outputs; o++) {
         const int8_t *restrict w = l->weights + (size_t)o * stride;
         int32_t sum = 0;
@@ -342,11 +462,22 @@ static void predict(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < m->code; i++) s->next[i] = (1.0f - m->decay) * s->latent[i] + x[i];
 }
 
+/* Adds a dense layer without bias to y. */
+static void add_dense(const layer *l, const float *x, float *y, float *spare, psi_state *s) {
+    dense(l, x, spare, s);
+    for (int32_t i = 0; i < l->outputs; i++) y[i] += spare[i];
+}
+
+static void first_of_decoder(const psi_model *m, psi_state *s, float *read, float *spare) {
+    dense(&m->read, s->latent, read, s);
+    if (m->forced) add_dense(&m->f.read_fine, s->latent, read, spare, s);
+}
+
 /* The garment in the canonical pose [3][vertices]. */
-static const float *decode(const psi_model *m, psi_state *s) {
+static const float *decode(const psi_model *m, psi_state *s, const layer *shapes) {
     float *x = s->rows[0], *y = s->rows[1], *read = s->rows[2];
     const int32_t wide = m->decode[0].inputs, last = m->decode[m->decoder - 1].outputs;
-    dense(&m->read, s->latent, read, s);
+    first_of_decoder(m, s, read, x);
     if (!m->read.inputs)
         for (int32_t i = 0; i < m->read.outputs; i++) read[i] += s->latent[m->code - m->read.outputs + i];
     memcpy(x, read, wide * sizeof(float));
@@ -362,12 +493,12 @@ static const float *decode(const psi_model *m, psi_state *s) {
         dense(&m->mix, x, y, s);
         x = y, y = s->rows[2];
     }
-    dense(&m->shapes, x, y, s);
+    dense(shapes, x, y, s);
     return y;
 }
 
-static void skin(const psi_model *m, psi_state *s, const float *garment, float *vertices) {
-    const int32_t count = m->vertices, padded = (count + LANES - 1) / LANES * LANES;
+/* The transforms of the joints that move something, in s->skinning. */
+static void bones(const psi_model *m, psi_state *s) {
     for (int32_t k = 0; k < m->moving; k++) {
         const int32_t j = m->bone[k];
         float *to = s->skinning + 12 * k, offset[3];
@@ -377,11 +508,15 @@ static void skin(const psi_model *m, psi_state *s, const float *garment, float *
             to[4 * c + 3] = s->positions[3 * j + c] - offset[c];
         }
     }
+}
+
+static void skin(const psi_model *m, psi_state *s, const float *garment, float *vertices) {
+    const int32_t count = m->vertices, wide = padded(count);
     for (int32_t v = 0; v < count; v += LANES) {
         const float *x = garment + v, *y = x + count, *z = y + count;
         float moved[3][LANES] = {{0}}, shown[LANES][3];
         for (int32_t k = 0; k < m->moving; k++) {
-            const float *w = m->weight + (size_t)k * padded + v, *a = s->skinning + 12 * k;
+            const float *w = m->weight + (size_t)k * wide + v, *a = s->skinning + 12 * k;
             for (int i = 0; i < LANES; i++) {
                 moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
                 moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
@@ -394,6 +529,404 @@ static void skin(const psi_model *m, psi_state *s, const float *garment, float *
     }
 }
 
+/* forces: clothjax/runtime/drape.py and clothjax/physics/elastic_forces.py */
+
+/* An exact layer, into y. */
+static void dense_exact(const exact *e, const float *x, float *y, float *spare, psi_state *s) {
+    dense(&e->coarse, x, y, s);
+    add_dense(&e->fine, x, y, spare, s);
+}
+
+/* A dense layer without bias on all kinds at once: reading its weights takes longest. */
+static void dense_kinds(const layer *l, float *const *x, float *const *y, psi_state *s) {
+    const int32_t stride = l->stride, room = INT32_MAX / (128 * stride), most = room < INT16_MAX ? room : INT16_MAX;
+    const int16_t *q[KINDS];
+    float step[KINDS];
+    for (int k = 0; k < KINDS; k++) {
+        const float limit = largest(x[k], l->gain, l->inputs);
+        const int some = limit > LEAST && limit <= FLT_MAX;
+        step[k] = some ? limit / most : 0.0f;
+        q[k] = s->fixed + (size_t)k * stride;
+        if (some) {
+            quantise(l, x[k], most / limit, s->fixed + (size_t)k * stride);
+        } else {
+            memset(s->fixed + (size_t)k * stride, 0, stride * sizeof(int16_t));
+        }
+    }
+    const int16_t *restrict a = q[0], *restrict b = q[1], *restrict c = q[2];
+    for (int32_t o = 0; o < l->outputs; o++) {
+        const int8_t *restrict w = l->weights + (size_t)o * stride;
+        int32_t first = 0, second = 0, third = 0;
+        for (int32_t i = 0; i < stride; i++) {
+            first += (int32_t)w[i] * a[i];
+            second += (int32_t)w[i] * b[i];
+            third += (int32_t)w[i] * c[i];
+        }
+        y[0][o] = step[0] * l->scale[o] * (float)first;
+        y[1][o] = step[1] * l->scale[o] * (float)second;
+        y[2][o] = step[2] * l->scale[o] * (float)third;
+    }
+}
+
+/* The transforms [12][vertices] of vertices, from those of the joints. */
+static void blend(const psi_model *m, const psi_state *s, const float *weight, int32_t count, float *rows) {
+    const int32_t wide = padded(count);
+    for (int32_t v = 0; v < wide; v += LANES) {
+        for (int c = 0; c < 12; c++) {
+            float sum[LANES] = {0};
+            for (int32_t k = 0; k < m->moving; k++) {
+                const float *w = weight + (size_t)k * wide + v, a = s->skinning[12 * k + c];
+                for (int i = 0; i < LANES; i++) sum[i] += w[i] * a;
+            }
+            memcpy(rows + (size_t)c * wide + v, sum, sizeof sum);
+        }
+    }
+}
+
+/* Rows [3][wide] moved by transforms [12][wide], and by an offset [3]. */
+static void apply(const float *restrict rows, const float *restrict x, const float *offset, size_t wide,
+                  float *restrict moved) {
+    for (int c = 0; c < 3; c++) {
+        const float *r = rows + 4 * c * wide, by = offset[c];
+        for (size_t v = 0; v < wide; v++)
+            moved[c * wide + v] = r[v] * x[v] + r[wide + v] * x[wide + v] + r[2 * wide + v] * x[2 * wide + v] +
+                                  r[3 * wide + v] + by;
+    }
+}
+
+/* The part of the body that can be touched, relative to the root of the last frame, and the centres of its faces. */
+static void pose_body(const psi_model *m, psi_state *s, const float *advance) {
+    const forces *f = &m->f;
+    const int32_t wide = padded(f->body), faces = padded(f->faces);
+    for (int32_t v = 0; v < wide; v += LANES) {
+        const float *x = f->body_rest + v, *y = x + wide, *z = y + wide;
+        float moved[3][LANES] = {{0}};
+        for (int32_t k = 0; k < m->moving; k++) {
+            const float *w = f->body_weight + (size_t)k * wide + v, *a = s->skinning + 12 * k;
+            for (int i = 0; i < LANES; i++) {
+                moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
+                moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
+                moved[2][i] += w[i] * (a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11]);
+            }
+        }
+        for (int c = 0; c < 3; c++)
+            for (int i = 0; i < LANES; i++) s->body[c * wide + v + i] = moved[c][i] + advance[c];
+    }
+    for (int c = 0; c < 3; c++) {
+        const float *x = s->body + c * wide;
+        const int32_t *a = f->face, *b = a + faces, *d = b + faces;
+        for (int32_t i = 0; i < faces; i++) s->centre[c * faces + i] = (x[a[i]] + x[b[i]] + x[d[i]]) / 3.0f;
+    }
+}
+
+/* 1 / sqrt(x) of a positive x, by three steps of Newton: sqrtf may set errno, and keeps loops from being vectors. */
+static inline float inverse_root(float x) {
+    int32_t bits;
+    float y;
+    memcpy(&bits, &x, sizeof bits);
+    bits = 0x5f3759df - (bits >> 1);
+    memcpy(&y, &bits, sizeof y);
+    for (int i = 0; i < 3; i++) y *= 1.5f - 0.5f * x * y * y;
+    return y;
+}
+
+static inline void cross(const float *a, const float *b, float *c) {
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+static void push_momentum(const psi_model *m, psi_state *s, float *restrict force) {
+    const forces *f = &m->f;
+    const size_t wide = padded(f->vertices);
+    const float rate = 1.0f / (f->timestep * f->timestep);
+    for (int c = 0; c < 3; c++) {
+        const float *held = s->held + c * wide, *x = s->position + c * wide, *v = s->velocity + c * wide;
+        const float beside = s->external[c] - (c == 1 ? f->gravity : 0.0f);
+        for (size_t i = 0; i < wide; i++)
+            force[c * wide + i] = f->mass[i] * (beside - rate * (held[i] - x[i] - v[i]));
+    }
+}
+
+/* The plane of the face, of a vertex's candidates, whose centre is nearest pushes it out. */
+static void push_contact(const psi_model *m, psi_state *s, float *force) {
+    const forces *f = &m->f;
+    const int32_t wide = padded(f->vertices), faces = padded(f->faces), body = padded(f->body);
+    const float *cx = s->centre, *cy = cx + faces, *cz = cy + faces;
+    for (int32_t v = 0; v < wide; v += LANES) {
+        const float *x = s->held + v, *y = x + wide, *z = y + wide;
+        float least[LANES];
+        int32_t nearest[LANES];
+        for (int i = 0; i < LANES; i++) least[i] = FLT_MAX, nearest[i] = f->candidate[v + i];
+        for (int32_t k = 0; k < f->candidates; k++) {
+            const int32_t *each = f->candidate + (size_t)k * wide + v;
+            for (int i = 0; i < LANES; i++) {
+                const int32_t j = each[i];
+                const float a = x[i] - cx[j], b = y[i] - cy[j], c = z[i] - cz[j], apart = a * a + b * b + c * c;
+                nearest[i] = apart < least[i] ? j : nearest[i];
+                least[i] = apart < least[i] ? apart : least[i];
+            }
+        }
+        for (int i = 0; i < LANES; i++) {
+            const int32_t j = nearest[i];
+            float e[3], l[3], normal[3], at[3] = {x[i] - cx[j], y[i] - cy[j], z[i] - cz[j]};
+            for (int c = 0; c < 3; c++) {
+                const float *p = s->body + c * body;
+                e[c] = p[f->face[faces + j]] - p[f->face[j]];
+                l[c] = p[f->face[2 * faces + j]] - p[f->face[j]];
+            }
+            cross(e, l, normal);
+            const float square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
+            const float size = square > 1e-30f ? inverse_root(square) : 0.0f;
+            const float gap = size * (at[0] * normal[0] + at[1] * normal[1] + at[2] * normal[2]);
+            const float depth = gap < f->offset ? f->offset - gap : 0.0f;
+            for (int c = 0; c < 3; c++)
+                force[c * wide + v + i] = 3.0f * f->stiffness * depth * depth * size * normal[c];
+        }
+    }
+}
+
+/* Corners of elements [count][3][LANES], from rows [3][wide]; and the same, back, added. */
+static void gather(const float *rows, size_t wide, const int32_t *index, size_t stride, int count,
+                   float to[][3][LANES]) {
+    for (int k = 0; k < count; k++)
+        for (int c = 0; c < 3; c++)
+            for (int i = 0; i < LANES; i++) to[k][c][i] = rows[c * wide + index[k * stride + i]];
+}
+
+static void scatter(float *rows, size_t wide, const int32_t *index, size_t stride, int count,
+                    float from[][3][LANES]) {
+    for (int k = 0; k < count; k++)
+        for (int i = 0; i < LANES; i++)
+            for (int c = 0; c < 3; c++) rows[c * wide + index[k * stride + i]] -= from[k][c][i];
+}
+
+static void push_stretching(const forces *f, const float *held, float *force) {
+    const size_t wide = padded(f->vertices), count = padded(f->triangles);
+    for (size_t t = 0; t < count; t += LANES) {
+        float x[3][3][LANES], g[3][3][LANES];
+        gather(held, wide, f->corner + t, count, 3, x);
+        for (int i = 0; i < LANES; i++) {
+            const float a = f->inverse[t + i], b = f->inverse[count + t + i], c = f->inverse[2 * count + t + i],
+                        d = f->inverse[3 * count + t + i];
+            float along[3], across[3], left[3], right[3];
+            for (int k = 0; k < 3; k++) {
+                const float p = x[0][k][i] - x[2][k][i], q = x[1][k][i] - x[2][k][i];
+                along[k] = a * p + c * q;
+                across[k] = b * p + d * q;
+            }
+            const float s0 = 0.5f * (along[0] * along[0] + along[1] * along[1] + along[2] * along[2] - 1.0f),
+                        s1 = 0.5f * (along[0] * across[0] + along[1] * across[1] + along[2] * across[2]),
+                        s2 = 0.5f * (across[0] * across[0] + across[1] * across[1] + across[2] * across[2] - 1.0f),
+                        trace = f->trace[t + i] * (s0 + s2), k0 = f->shear[t + i] * s0 + trace,
+                        k1 = f->shear[t + i] * s1, k2 = f->shear[t + i] * s2 + trace;
+            for (int k = 0; k < 3; k++) {
+                left[k] = k0 * along[k] + k1 * across[k];
+                right[k] = k1 * along[k] + k2 * across[k];
+                g[0][k][i] = a * left[k] + b * right[k];
+                g[1][k][i] = c * left[k] + d * right[k];
+                g[2][k][i] = -g[0][k][i] - g[1][k][i];
+            }
+        }
+        scatter(force, wide, f->corner + t, count, 3, g);
+    }
+}
+
+/* The arc tangent of y / x (Abramowitz and Stegun 4.4.49), without a branch. */
+static inline float arc(float y, float x) {
+    const float a = fabsf(x), b = fabsf(y), more = a > b ? a : b, less = a > b ? b : a, q = more > 0.0f ? less / more : 0.0f,
+                t = q * q;
+    float angle = q * (1.0f + t * (-0.3333314528f + t * (0.1999355085f + t * (-0.1420889944f + t * (0.1065626393f +
+                  t * (-0.0752896400f + t * (0.0429096138f + t * (-0.0161657367f + t * 0.0028662257f))))))));
+    angle = b > a ? 1.57079633f - angle : angle;
+    angle = x < 0.0f ? 3.14159265f - angle : angle;
+    return y < 0.0f ? -angle : angle;
+}
+
+static void push_bending(const forces *f, const float *held, float *force) {
+    const size_t wide = padded(f->vertices), count = padded(f->hinges);
+    for (size_t h = 0; h < count; h += LANES) {
+        float x[4][3][LANES], g[4][3][LANES];
+        gather(held, wide, f->hinge + h, count, 4, x);
+        for (int i = 0; i < LANES; i++) {
+            /* one name a coordinate, else the loop does not become vectors */
+            const float ax = x[0][0][i], ay = x[0][1][i], az = x[0][2][i];
+            const float ex = x[1][0][i] - ax, ey = x[1][1][i] - ay, ez = x[1][2][i] - az;
+            const float lx = x[2][0][i] - ax, ly = x[2][1][i] - ay, lz = x[2][2][i] - az;
+            const float rx = x[3][0][i] - ax, ry = x[3][1][i] - ay, rz = x[3][2][i] - az;
+            const float nx = ey * lz - ez * ly, ny = ez * lx - ex * lz, nz = ex * ly - ey * lx;
+            const float ox = ry * ez - rz * ey, oy = rz * ex - rx * ez, oz = rx * ey - ry * ex;
+            const float sine = (ny * oz - nz * oy) * ex + (nz * ox - nx * oz) * ey + (nx * oy - ny * ox) * ez;
+            const float cosine = nx * ox + ny * oy + nz * oz;
+            float ee = ex * ex + ey * ey + ez * ez, nn = nx * nx + ny * ny + nz * nz, oo = ox * ox + oy * oy + oz * oz;
+            const float ll = lx * lx + ly * ly + lz * lz, rr = rx * rx + ry * ry + rz * rz;
+            const float longest = ee > ll ? ee : ll, size = longest > rr ? longest : rr, area = nn < oo ? nn : oo;
+            const float bent = area > SLIVER * SLIVER * size * size ? 1.0f : 0.0f;
+            ee += 1.0f - bent, nn += 1.0f - bent, oo += 1.0f - bent; /* where it is flat they are nearly zero */
+            const float length = ee * inverse_root(ee), angle = arc(sine, cosine * length) - f->angle[h + i];
+            const float weight = bent * f->bend[h + i], torque = weight * ee * angle * length;
+            const float longer = weight * angle * angle, u = -torque / nn, w = -torque / oo;
+            const float p = (lx * ex + ly * ey + lz * ez) / ee, q = (rx * ex + ry * ey + rz * ez) / ee;
+            const float sx = p * u * nx + q * w * ox, sy = p * u * ny + q * w * oy, sz = p * u * nz + q * w * oz;
+            g[2][0][i] = u * nx, g[2][1][i] = u * ny, g[2][2][i] = u * nz;
+            g[3][0][i] = w * ox, g[3][1][i] = w * oy, g[3][2][i] = w * oz;
+            g[1][0][i] = longer * ex - sx, g[1][1][i] = longer * ey - sy, g[1][2][i] = longer * ez - sz;
+            g[0][0][i] = sx - u * nx - w * ox - longer * ex;
+            g[0][1][i] = sy - u * ny - w * oy - longer * ey;
+            g[0][2][i] = sz - u * nz - w * oz - longer * ez;
+        }
+        scatter(force, wide, f->hinge + h, count, 4, g);
+    }
+}
+
+/* What the layers of the decoder give before each ReLU, for a code, in s->read. */
+static void read_code(const psi_model *m, psi_state *s) {
+    float *x = s->rows[0];
+    first_of_decoder(m, s, s->read[0], x);
+    for (int32_t l = 0; l < m->decoder; l++) {
+        const int32_t inputs = m->decode[l].inputs;
+        if (l + 1 == m->decoder && !m->relu) break; /* the weights themselves have no ReLU */
+        memcpy(x, s->read[l], inputs * sizeof(float));
+        relu(x, inputs);
+        dense(&m->decode[l], x, s->read[l + 1], s);
+    }
+    for (int32_t i = 0; m->relu && m->skip && i < m->decode[m->decoder - 1].outputs; i++)
+        s->read[m->decoder][i] += s->read[0][m->decode[0].inputs + i];
+}
+
+static void masked(float *g, const float *before, int32_t count) {
+    for (int32_t i = 0; i < count; i++) g[i] = before[i] > 0.0f ? g[i] : 0.0f;
+}
+
+/* Forces on vertices, pulled back to whitened codes, in s->pulled. */
+static void pull_back(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const size_t count = f->vertices, wide = padded(f->vertices);
+    const int32_t first = m->decode[0].inputs, last = m->decode[m->decoder - 1].outputs;
+    float *canonical[KINDS], *other[KINDS], *weights[KINDS];
+    read_code(m, s);
+    for (int k = 0; k < KINDS; k++) {
+        const float *push = s->force + 3 * k * wide;
+        canonical[k] = s->rows[k];
+        for (int b = 0; b < 3; b++) {
+            const float *r = s->blended + b * wide;
+            for (size_t v = 0; v < count; v++)
+                canonical[k][b * count + v] =
+                    r[v] * push[v] + r[4 * wide + v] * push[wide + v] + r[8 * wide + v] * push[2 * wide + v];
+        }
+        weights[k] = s->pulled[k];
+    }
+    dense_kinds(&f->unshape, canonical, weights, s);
+    if (m->mixed) {
+        dense_kinds(&f->unmix, weights, canonical, s);
+        for (int k = 0; k < KINDS; k++) memcpy(weights[k], canonical[k], last * sizeof(float));
+    }
+    for (int k = 0; k < KINDS; k++) {
+        if (m->relu) masked(weights[k], s->read[m->decoder], last);
+        /* the skip's part waits behind that of the decoder */
+        other[k] = s->pulled[k] + m->widest;
+        memcpy(other[k], weights[k], last * sizeof(float));
+    }
+    for (int32_t l = m->decoder - 1; l >= 0; l--) {
+        dense_kinds(&f->undecode[l], other, canonical, s);
+        for (int k = 0; k < KINDS; k++) {
+            masked(canonical[k], s->read[l], m->decode[l].inputs);
+            memcpy(other[k], canonical[k], m->decode[l].inputs * sizeof(float));
+        }
+    }
+    for (int k = 0; k < KINDS; k++) {
+        memcpy(canonical[k], other[k], first * sizeof(float));
+        if (m->skip) memcpy(canonical[k] + first, weights[k], last * sizeof(float));
+    }
+    dense_kinds(&f->unread.coarse, canonical, weights, s);
+    dense_kinds(&f->unread.fine, canonical, other, s);
+    for (int k = 0; k < KINDS; k++)
+        for (int32_t i = 0; i < m->code; i++) s->pulled[k][i] += other[k][i];
+}
+
+/* BOUND tanh of scaled inputs to 1e-6, with an exponential that has no branch. */
+static void soften(float *restrict x, const float *restrict middle, const float *restrict inverse, int32_t count) {
+    for (int32_t i = 0; i < count; i++) {
+        float y = (x[i] - middle[i]) * inverse[i];
+        y = y > 9.0f ? 9.0f : y < -9.0f ? -9.0f : y;
+        const float p = y * 2.88539008f, whole = (float)(int32_t)(p + (p < 0.0f ? -0.5f : 0.5f)),
+                    t = (p - whole) * 0.693147181f;
+        float e = 1.0f + t * (1.0f + t * (0.5f + t * (0.166666667f + t * (0.0416666667f + t * (0.00833333333f +
+                  t * 0.00138888889f)))));
+        int32_t bits;
+        memcpy(&bits, &e, sizeof bits);
+        bits += (int32_t)whole * (1 << 23);
+        memcpy(&e, &bits, sizeof e);
+        x[i] = BOUND * (e - 1.0f) / (e + 1.0f);
+    }
+}
+
+/* The next code from the forces on the held garment at the new pose, in s->next. */
+static void predict_from_forces(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const size_t wide = padded(f->vertices);
+    const int32_t code = m->code;
+    float advance[3], *x = s->inputs, *y = s->rows[0], *z = s->rows[1], *elastic = s->force + 3 * wide;
+    for (int c = 0; c < 3; c++) advance[c] = s->translation[c] - s->translation[3 + c];
+    blend(m, s, f->weight, f->vertices, s->blended);
+    apply(s->blended, s->garment, advance, wide, s->held);
+    pose_body(m, s, advance);
+    push_momentum(m, s, s->force);
+    memset(elastic, 0, 3 * wide * sizeof(float));
+    push_stretching(f, s->held, elastic);
+    push_bending(f, s->held, elastic);
+    push_contact(m, s, s->force + 6 * wide);
+    pull_back(m, s);
+    memcpy(x, s->latent, code * sizeof(float));
+    dense_exact(&f->change, s->change, x + code, y, s);
+    for (int k = 0; k < KINDS; k++) memcpy(x + (2 + k) * code, s->pulled[k], code * sizeof(float));
+    soften(x, f->middle, f->inverse_spread, (2 + KINDS) * code);
+    dense(&f->first, x, y, s);
+    const int32_t width = f->first.outputs - code;
+    memcpy(s->next, y + width, code * sizeof(float)); /* the linear path */
+    for (int32_t l = 0; l < m->hidden; l++) {
+        relu(y, m->then[l].inputs);
+        dense(&m->then[l], y, z, s);
+        float *swap = y;
+        y = z, z = swap;
+    }
+    for (int32_t i = 0; i < code; i++) s->next[i] += y[i];
+    dense_exact(&f->move, s->next, z, y, s);
+    for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + z[i];
+}
+
+/* How the garment hangs after a step; the code before it is in s->next. */
+static void drape(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const size_t count = f->vertices, wide = padded(f->vertices);
+    const float *garment = decode(m, s, m->apart ? &f->felt_shapes : &m->shapes), still[3] = {0, 0, 0};
+    for (int c = 0; c < 3; c++) memcpy(s->garment + c * wide, garment + c * count, count * sizeof(float));
+    apply(s->blended, s->garment, still, wide, s->held);
+    for (int c = 0; c < 3; c++) {
+        const float advance = s->translation[c] - s->translation[3 + c];
+        float *x = s->position + c * wide, *v = s->velocity + c * wide, *now = s->held + c * wide;
+        for (size_t i = 0; i < wide; i++) v[i] = now[i] + advance - x[i], x[i] = now[i];
+    }
+    for (int32_t i = 0; i < m->code; i++) s->change[i] = s->latent[i] - s->next[i];
+}
+
+static void show(const psi_model *m, const psi_state *s, float *vertices) {
+    const size_t count = m->f.vertices, wide = padded(m->f.vertices);
+    for (size_t v = 0; v < count; v++)
+        for (int c = 0; c < 3; c++) vertices[3 * v + c] = s->position[c * wide + v] + s->translation[c];
+}
+
+/* Lets the garment hang on a body that stands. */
+static void settle(const psi_model *m, psi_state *s) {
+    const size_t wide = padded(m->f.vertices);
+    bones(m, s);
+    blend(m, s, m->f.weight, m->f.vertices, s->blended);
+    memcpy(s->next, s->latent, m->code * sizeof(float));
+    drape(m, s);
+    memset(s->velocity, 0, 3 * wide * sizeof(float));
+    for (int i = 0; i < SETTLING; i++) psi_step(m, s, s->rotations, s->translation, NULL);
+}
+
 static void older(float *rows, size_t size) { memmove(rows + size, rows, 2 * size * sizeof(float)); }
 
 int psi_step(const psi_model *m, psi_state *s, const float *rotations, const float *translation, float *vertices) {
@@ -403,18 +936,29 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     older(s->positions, 3 * joints);
     older(s->translation, 3);
     if (finite) { /* else the newest pose remains */
-        memcpy(s->rotations, rotations, 9 * joints * sizeof(float));
-        memcpy(s->translation, translation, 3 * sizeof(float));
+        memmove(s->rotations, rotations, 9 * joints * sizeof(float)); /* it may be its own */
+        memmove(s->translation, translation, 3 * sizeof(float));
     }
     kinematics(m, s->rotations, s->global, s->positions);
-    pose_inputs(m, s, s->inputs);
-    for (int32_t i = 0; i < m->pose.inputs; i++) s->inputs[i] -= m->pose_mean[i];
-    const int ordinary = clamp(s->inputs, &m->pose_bounds, m->pose.inputs);
-    predict(m, s);
+    bones(m, s);
+    int ordinary = 1;
+    if (m->forced) {
+        predict_from_forces(m, s);
+    } else {
+        pose_inputs(m, s, s->inputs);
+        for (int32_t i = 0; i < m->pose.inputs; i++) s->inputs[i] -= m->pose_mean[i];
+        ordinary = clamp(s->inputs, &m->pose_bounds, m->pose.inputs);
+        predict(m, s);
+    }
     const int inside = clamp(s->next, &m->code_bounds, m->code);
     float *swap = s->latent;
     s->latent = s->next, s->next = swap;
-    if (vertices) skin(m, s, decode(m, s), vertices);
+    if (m->forced) drape(m, s);
+    if (vertices && m->forced && !m->apart) {
+        show(m, s, vertices);
+    } else if (vertices) {
+        skin(m, s, decode(m, s, &m->shapes), vertices);
+    }
     return finite && ordinary && inside && m->known;
 }
 
@@ -437,12 +981,24 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->skinning = part(room, &used, 12 * joints);
     s->inputs = part(room, &used, m->longest);
     for (int i = 0; i < 3; i++) s->rows[i] = part(room, &used, widest);
-    s->fixed = (int16_t *)part(room, &used, m->longest / 2);
+    s->fixed = (int16_t *)part(room, &used, KINDS * m->longest / 2);
+    if (!m->forced) return used;
+    const size_t vertices = padded(m->f.vertices);
+    s->change = part(room, &used, m->code);
+    s->garment = part(room, &used, 3 * vertices);
+    s->position = part(room, &used, 3 * vertices);
+    s->velocity = part(room, &used, 3 * vertices);
+    s->held = part(room, &used, 3 * vertices);
+    s->blended = part(room, &used, 12 * vertices);
+    s->force = part(room, &used, 3 * KINDS * vertices);
+    s->body = part(room, &used, 3 * (size_t)padded(m->f.body));
+    s->centre = part(room, &used, 3 * (size_t)padded(m->f.faces));
+    for (int k = 0; k < KINDS; k++) s->pulled[k] = part(room, &used, 2 * (size_t)m->widest);
+    for (int32_t i = 0; i <= m->decoder; i++) s->read[i] = part(room, &used, m->widest);
     return used;
 }
 
-psi_state *psi_begin(const psi_model *m, const float *rotations, const float *translation) {
-    const size_t joints = m->joints;
+psi_state *psi_blank(const psi_model *m) {
     psi_state empty, *s = calloc(1, sizeof *s);
     if (s) s->memory = calloc(arrange(m, &empty, NULL) * sizeof(float) + ALIGN, 1);
     if (!s || !s->memory) {
@@ -450,6 +1006,13 @@ psi_state *psi_begin(const psi_model *m, const float *rotations, const float *tr
         return NULL;
     }
     arrange(m, s, (float *)aligned(s->memory));
+    return s;
+}
+
+psi_state *psi_begin(const psi_model *m, const float *rotations, const float *translation) {
+    const size_t joints = m->joints;
+    psi_state *s = psi_blank(m);
+    if (!s) return NULL;
     memcpy(s->latent, m->start, m->code * sizeof(float));
     if (sound(m, rotations, translation)) {
         memcpy(s->rotations, rotations, 9 * joints * sizeof(float));
@@ -462,6 +1025,7 @@ psi_state *psi_begin(const psi_model *m, const float *rotations, const float *tr
     memcpy(s->rotations + 9 * joints, s->rotations, 9 * joints * sizeof(float));
     memcpy(s->positions + 3 * joints, s->positions, 3 * joints * sizeof(float));
     memcpy(s->translation + 3, s->translation, 3 * sizeof(float));
+    if (m->forced) settle(m, s);
     return s;
 }
 
@@ -470,18 +1034,48 @@ void psi_end(psi_state *s) {
     free(s);
 }
 
-int psi_carried(const psi_model *m) { return m->code + 24 * m->joints + 6; }
+int psi_push(const psi_model *m, psi_state *s, const float *external) {
+    memcpy(s->external, external, sizeof s->external);
+    return m->forced != 0;
+}
+
+int psi_carried(const psi_model *m) {
+    return m->code + 24 * m->joints + 6 + (m->forced ? m->code + 9 * m->f.vertices : 0);
+}
+
+/* Rows [3][vertices] as they are carried: as they are, or one vertex after the other. */
+static float *put_rows(const forces *f, const float *rows, int whole, float *to) {
+    const size_t count = f->vertices, wide = padded(f->vertices);
+    for (size_t v = 0; v < count; v++)
+        for (int c = 0; c < 3; c++) to[whole ? c * count + v : 3 * v + c] = rows[c * wide + v];
+    return to + 3 * count;
+}
+
+static const float *take_rows(const forces *f, float *rows, int whole, const float *from) {
+    const size_t count = f->vertices, wide = padded(f->vertices);
+    for (size_t v = 0; v < count; v++)
+        for (int c = 0; c < 3; c++) rows[c * wide + v] = from[whole ? c * count + v : 3 * v + c];
+    return from + 3 * count;
+}
 
 void psi_keep(const psi_model *m, const psi_state *s, float *carried) {
     memcpy(carried, s->latent, m->code * sizeof(float));
     memcpy(carried += m->code, s->rotations, 18 * m->joints * sizeof(float));
     memcpy(carried += 18 * m->joints, s->positions, 6 * m->joints * sizeof(float));
-    memcpy(carried + 6 * m->joints, s->translation, 6 * sizeof(float));
+    memcpy(carried += 6 * m->joints, s->translation, 6 * sizeof(float));
+    if (!m->forced) return;
+    memcpy(carried += 6, s->change, m->code * sizeof(float));
+    carried = put_rows(&m->f, s->garment, 1, carried + m->code);
+    put_rows(&m->f, s->velocity, 0, put_rows(&m->f, s->position, 0, carried));
 }
 
 void psi_put_back(const psi_model *m, psi_state *s, const float *carried) {
     memcpy(s->latent, carried, m->code * sizeof(float));
     memcpy(s->rotations, carried += m->code, 18 * m->joints * sizeof(float));
     memcpy(s->positions, carried += 18 * m->joints, 6 * m->joints * sizeof(float));
-    memcpy(s->translation, carried + 6 * m->joints, 6 * sizeof(float));
+    memcpy(s->translation, carried += 6 * m->joints, 6 * sizeof(float));
+    if (!m->forced) return;
+    memcpy(s->change, carried += 6, m->code * sizeof(float));
+    carried = take_rows(&m->f, s->garment, 1, carried + m->code);
+    take_rows(&m->f, s->velocity, 0, take_rows(&m->f, s->position, 0, carried));
 }

@@ -31,9 +31,15 @@ int psi_vertices(const psi_model *model);
 float psi_fps(const psi_model *model);
 
 /* The state of a character that has been standing in a pose, rotations [joints][9], translation [3]; NULL without
- * memory. */
+ * memory. A garment with forces has settled. */
 psi_state *psi_begin(const psi_model *model, const float *rotations, const float *translation);
+/* A state without any pose, which psi_put_back has to fill; NULL without memory. */
+psi_state *psi_blank(const psi_model *model);
 void psi_end(psi_state *state);
+
+/* An acceleration of the cloth beside gravity, external [3] m/s^2, such as wind, in all frames to come. Whether the
+ * model feels it: only one with forces does. */
+int psi_push(const psi_model *model, psi_state *state, const float *external);
 
 /* The next frame: vertices [vertices][3] in the world, or NULL for a garment that nobody sees. It takes no memory.
  * 0 where the pose, the wearer or the code was out of the range of training and was brought into it. */
@@ -41,7 +47,8 @@ int psi_step(const psi_model *model, psi_state *state, const float *rotations, c
              float *vertices);
 
 /* What of a state goes on from frame to frame, psi_carried() floats, to be kept and put back: the code, then of the last
- * two poses, newest first, the rotations, the joints' positions [2][joints][3] and the translations. */
+ * two poses, newest first, the rotations, the joints' positions [2][joints][3] and the translations. With forces, then
+ * the change of the code, the canonical garment [3][vertices], and its positions and velocities [vertices][3]. */
 int psi_carried(const psi_model *model);
 void psi_keep(const psi_model *model, const psi_state *state, float *carried);
 void psi_put_back(const psi_model *model, psi_state *state, const float *carried);

@@ -5,7 +5,8 @@
 namespace ffi = xla::ffi;
 
 static ffi::Error Step(ffi::Buffer<ffi::U8> file, ffi::Buffer<ffi::F32> carried, ffi::Buffer<ffi::F32> rotations,
-                       ffi::Buffer<ffi::F32> translation, ffi::ResultBuffer<ffi::F32> next,
+                       ffi::Buffer<ffi::F32> translation, ffi::Buffer<ffi::F32> external,
+                       ffi::ResultBuffer<ffi::F32> next,
                        ffi::ResultBuffer<ffi::PRED> ok, ffi::ResultBuffer<ffi::F32> vertices) {
   const char *error = nullptr;
   psi_model *model = psi_open(file.typed_data(), file.element_count(), &error);
@@ -13,10 +14,12 @@ static ffi::Error Step(ffi::Buffer<ffi::U8> file, ffi::Buffer<ffi::F32> carried,
   const size_t count = psi_carried(model), seen = vertices->element_count();
   const bool fits = carried.element_count() == count && next->element_count() == count &&
                     rotations.element_count() == 9 * (size_t)psi_joints(model) && translation.element_count() == 3 &&
+                    external.element_count() == 3 &&
                     (seen == 0 || seen == 3 * (size_t)psi_vertices(model));
-  psi_state *state = fits ? psi_begin(model, rotations.typed_data(), translation.typed_data()) : nullptr;
+  psi_state *state = fits ? psi_blank(model) : nullptr;
   if (state) {
     psi_put_back(model, state, carried.typed_data());
+    psi_push(model, state, external.typed_data());
     *ok->typed_data() = psi_step(model, state, rotations.typed_data(), translation.typed_data(),
                                  seen ? vertices->typed_data() : nullptr);
     psi_keep(model, state, next->typed_data());
@@ -30,6 +33,7 @@ static ffi::Error Step(ffi::Buffer<ffi::U8> file, ffi::Buffer<ffi::F32> carried,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(PsiStep, Step,
                               ffi::Ffi::Bind()
                                   .Arg<ffi::Buffer<ffi::U8>>()
+                                  .Arg<ffi::Buffer<ffi::F32>>()
                                   .Arg<ffi::Buffer<ffi::F32>>()
                                   .Arg<ffi::Buffer<ffi::F32>>()
                                   .Arg<ffi::Buffer<ffi::F32>>()

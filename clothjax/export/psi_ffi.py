@@ -17,6 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from clothjax.export import native
+from clothjax.runtime import inference
 from clothjax.runtime.models import Model, State
 from clothjax.types import Array, Pose
 
@@ -67,7 +68,9 @@ def _register() -> None:
 
 
 @functools.partial(jax.jit, static_argnames="vertices")
-def step(packed: Packed, state: State, pose: Pose, vertices: bool = True) -> tuple[State, Array | None]:
+def step(
+    packed: Packed, state: State, pose: Pose, vertices: bool = True, external: Array | None = None
+) -> tuple[State, Array | None]:
     """Compute the next frame as `inference.step` does, but by plain C: a new state, and vertices [V, 3] m in the world.
 
     Args:
@@ -75,15 +78,20 @@ def step(packed: Packed, state: State, pose: Pose, vertices: bool = True) -> tup
         state: first that of `inference.initial_state` for the model itself.
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
         vertices: False for a garment that nobody sees: they are then None.
+        external: [3] m/s^2, as of `inference.step`.
 
     Raises:
+        ValueError: for an external acceleration of a Psi without forces.
         jax.errors.JaxRuntimeError: for a state or a pose of another garment, or a damaged file.
     """
-    carried, restored = ravel_pytree(state[:4])
+    if external is not None and state.drape is None:
+        raise ValueError(inference.NOT_FELT)
+    carried, restored = ravel_pytree((state[:4], state.drape))
+    external = jnp.zeros(3) if external is None else jnp.asarray(external, jnp.float32)
     shape = (packed.vertices if vertices else 0, 3)
     kinds = [jax.ShapeDtypeStruct(carried.shape, jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_),
              jax.ShapeDtypeStruct(shape, jnp.float32)]  # fmt: skip
     call = jax.ffi.ffi_call(TARGET, kinds, vmap_method="sequential")
-    carried, ok, garment = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose))
-    latent, rotations, positions, translation = restored(carried)
-    return State(latent, rotations, positions, translation, ok), garment if vertices else None
+    carried, ok, garment = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose), external)
+    history, drape = restored(carried)
+    return State(*history, ok, drape), garment if vertices else None

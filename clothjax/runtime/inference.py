@@ -23,6 +23,7 @@ from clothjax.runtime.models import Layer, Model, PosePredictor, State, Wearer
 from clothjax.types import Array, Motion, Pose
 
 FARTHEST = 1e6  # m from the origin, where float32 has steps of 6 cm
+NOT_FELT = "this model feels no external acceleration: it was trained without stage2.forces"
 SETTLING = 60  # frames that a garment with forces settles for before the first
 T = TypeVar("T")
 
@@ -86,7 +87,7 @@ def _advanced(
     hung = state.drape
     if isinstance(network.predictor, PosePredictor):
         if external is not None:
-            raise ValueError("this model feels no external acceleration: it was trained without stage2.forces")
+            raise ValueError(NOT_FELT)
         inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.input_joints), model.config.fps)
         inputs, ordinary = normalisation.bounded(inputs - network.predictor.pose_mean, *network.predictor.pose_bounds)
         latent = predict(network.predictor, state.latent, inputs, wearer.bias, model.config)
