@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax.export import sidecar
+from clothjax.export import onnx_forces, sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.models import FoldedLayer, Layer, Model
+from clothjax.runtime.models import FoldedLayer, ForcePredictor, Layer, Model
 from clothjax.types import Array, Motion, Pose
 
-INPUTS = ("latent", "history", "rotations", "translation")
+STATE = ("latent", "history")  # and with forces `onnx_forces.DRAPE`
+POSE = ("rotations", "translation")
+INPUTS = (*STATE, *POSE)  # without forces
 FOLLOWING = ("next_latent", "next_history", "ok")
 
 
@@ -32,7 +34,8 @@ def to_onnx(
     All inputs and outputs have a leading axis [N] of characters. The state is `latent` [C]
     and `history` [2, 12 J + 3] of the last two frames, the pose to come `rotations` [J, 3, 3] local and `translation`
     [3] m.
-    Outputs are the next state (`next_latent`, `next_history`), `ok` (see `inference`) and `vertices`.
+    Outputs are the next state (`next_latent`, `next_history`), `ok` (see `inference`) and `vertices`. With forces the
+    state also has the arrays of `models.Drape`, and an input `external` [3] m/s^2.
 
     Args:
         batch: N; None if it may differ from call to call. All characters have the same body and cloth.
@@ -48,19 +51,20 @@ def to_onnx(
     inputs, outputs, graph = _frame(model, "N" if batch is None else batch, int8, output)
     graph.save(path, inputs, outputs, flags=("ok",))
     shapes = {"shapes": {name: list(shape) for name, shape in (inputs | outputs).items()}}
-    sidecar.write(model, path, output, sidecar.STATE | shapes | (about or {}))
+    state = sidecar.STATE if model.wearer.cloth is None else sidecar.STATE_WITH_FORCES
+    sidecar.write(model, path, output, state | shapes | (about or {}))
     return path
 
 
 def first_state(model: Model, pose: Pose, batch: int = 1) -> list[np.ndarray]:
-    """Return `latent` [N, C] and `history` [N, 2, 12 J + 3] before the first frame.
+    """Return `latent` [N, C], `history` [N, 2, 12 J + 3] and, with forces, the drape before the first frame.
 
     They are of N = `batch` characters that have been standing in `pose`.
     """
     state = inference.initial_state(model, pose)
     rows = (state.rotations, state.translation, state.positions)
     history = np.concatenate([np.asarray(x).reshape(2, -1) for x in rows], axis=1)
-    return [np.repeat(np.asarray(x)[None], batch, axis=0) for x in (state.latent, history)]
+    return [np.repeat(np.asarray(x)[None], batch, axis=0) for x in (state.latent, history, *(state.drape or ()))]
 
 
 def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
@@ -77,10 +81,13 @@ def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     batch = run.get_inputs()[0].shape[0]
     batch = batch if isinstance(batch, int) else 1
     state = first_state(model, Pose(rotations[0, 0], translation[0, 0]), batch)
+    names = (*STATE, *onnx_forces.DRAPE)[: len(state)]
+    external = {"external": np.zeros((batch, 3), np.float32)} if len(state) > len(STATE) else {}
     vertices = []
     for pose in zip(rotations, translation, strict=True):
         pose = [np.repeat(x, batch, axis=0) for x in pose]
-        results = run.run([*FOLLOWING[:-1], "vertices"], dict(zip(INPUTS, (*state, *pose), strict=True)))
+        given = dict(zip((*names, *POSE), (*state, *pose), strict=True)) | external
+        results = run.run([*(f"next_{name}" for name in names), "vertices"], given)
         *state, frame_vertices = map(np.asarray, results)
         vertices.append(frame_vertices[0])
     return np.stack(vertices)
@@ -95,13 +102,26 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     places = g.reshape(_places(g, chain, joints), 1, 3 * count)
     frames = g("Concat", g("Concat", pose, places, axis=2), "history", axis=1)
     g.slice(frames, 1, 0, 2, "next_history")
-    inputs, order = _inputs(g, frames, last, joints[model.input_joints[0]], model)
-    inputs = g("Sub", inputs, np.asarray(predictor.pose_mean)[order])
-    bounds = predictor.pose_bounds
-    inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
-    latent, strayed = predicted(g, inputs, model, order)
-    slack = np.concatenate([np.asarray(bounds.slack)[order], np.asarray(network.code_bounds.slack)])
-    fine = g.all(g("LessOrEqual", g("Concat", moved, strayed, axis=1), slack), axis=1)
+    moving = g("Gather", chain, np.array(model.moving, np.int64), axis=1)
+    transforms = g.slice(g.reshape(moving, len(model.moving), 16), 2, 0, 12)
+    slack = np.asarray(network.code_bounds.slack)
+    rows = advance = ""
+    if isinstance(predictor, ForcePredictor):
+        stepped = g("Sub", g.slice(pose, 2, 9 * count, 9 * count + 3), g.slice(last, 2, 9 * count, 9 * count + 3))
+        advance = g("Transpose", stepped, perm=[0, 2, 1])
+        rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
+        code = onnx_forces.next_code(g, model, rows, transforms, advance)
+        limits = network.code_bounds
+        latent, strayed = g.within(code, limits.low, limits.high, name="next_latent")
+    else:
+        inputs, order = _inputs(g, frames, last, joints[model.input_joints[0]], model)
+        inputs = g("Sub", inputs, np.asarray(predictor.pose_mean)[order])
+        bounds = predictor.pose_bounds
+        inputs, moved = g.within(inputs, np.asarray(bounds.low)[order], np.asarray(bounds.high)[order])
+        latent, strayed = predicted(g, inputs, model, order)
+        slack = np.concatenate([np.asarray(bounds.slack)[order], slack])
+        strayed = g("Concat", moved, strayed, axis=1)
+    fine = g.all(g("LessOrEqual", strayed, slack), axis=1)
     known = np.array([[bool(wearer.known)]])
     ok = g("And", g("And", fine, known), g("Reshape", sound, np.array([-1, 1], np.int64)))
     g("Reshape", ok, np.array([-1], np.int64), name="ok")
@@ -110,13 +130,22 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     given = {"latent": latent_shape, "history": history_shape}
     given |= {"rotations": (batch, count, 3, 3), "translation": (batch, 3)}
     following = {"next_latent": latent_shape, "next_history": history_shape, "ok": (batch,)}
+    vertices, garment, skinned = wearer.template.shape[1], "", ""
+    if isinstance(predictor, ForcePredictor):
+        drape = {name: (batch, *shape) for name, shape in onnx_forces.shapes(model).items()}
+        given |= drape | {"external": (batch, 3)}
+        following |= {f"next_{name}": shape for name, shape in drape.items()}
+        felt = onnx_forces.parts(model)
+        felt_garment = canonical(g, latent, model, felt.felt.shapes, felt.template)
+        skinned = onnx_forces.follow(g, model, latent, felt_garment, rows, advance)
+        if predictor.felt is None:
+            garment = felt_garment
     if output == "none":
         return given, following, g
-    vertices, garment = wearer.template.shape[1], canonical(g, latent, model)
+    garment = garment or canonical(g, latent, model)
     if output == "world":
-        moving = g("Gather", chain, np.array(model.moving, np.int64), axis=1)
-        transforms = g.slice(g.reshape(moving, len(model.moving), 16), 2, 0, 12)
-        skinned = g.skinned(garment, transforms, network.weights)
+        if not isinstance(predictor, ForcePredictor) or predictor.felt is not None:
+            skinned = g.skinned(garment, transforms, network.weights)
         placed = g("Add", skinned, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
         placed = g.reshape(garment, 3, vertices)
@@ -224,9 +253,15 @@ def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[s
     return g.within(g("Add", decayed, x), bounds.low, bounds.high, name="next_latent")
 
 
-def canonical(g: Graph, latent: str, model: Model) -> str:
-    """Return the garment [N, 3 V] m in the canonical pose, one coordinate after the other."""
-    shapes = Layer(model.network.shapes, np.asarray(model.wearer.template).reshape(-1))
+def canonical(g: Graph, latent: str, model: Model, rows: Array | None = None, template: Array | None = None) -> str:
+    """Return the garment [N, 3 V] m in the canonical pose, one coordinate after the other.
+
+    Args:
+        rows, template: [K, 3 V] and [3, V] m, shapes and template of a garment that is not the one shown.
+    """
+    rows = model.network.shapes if rows is None else rows
+    template = model.wearer.template if template is None else template
+    shapes = Layer(rows, np.asarray(template).reshape(-1))
     weights = shape_weights(g, latent, model)
     if not g.int8:
         return g.layer(weights, shapes)

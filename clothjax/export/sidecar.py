@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from clothjax.runtime.inference import SETTLING
 from clothjax.runtime.models import Model
 
 Output = Literal["world", "canonical", "none"]
@@ -18,6 +19,12 @@ STATE = {
     "state": "feed next_latent and next_history back",
     "first_state": "latent is first_latent. Run once with the first pose and any finite history; the first row of "
     "next_history, twice, is the history of a character that has been standing in that pose",
+}
+STATE_WITH_FORCES = {
+    "state": "feed what is called next_NAME back as NAME",
+    "external": "an acceleration of the cloth beside gravity, m/s^2, such as wind; zeros for none",
+    "first_state": "zeros, but for both rows of history: the rotations of the first pose, one after the other, its "
+    f"translation, and zeros. Run {SETTLING} times with the first pose: the garment has settled",
 }
 
 

@@ -1,0 +1,273 @@
+"""The part of an ONNX graph that a Psi with forces adds: forces on the garment, pulled back to the code.
+
+It follows `clothjax/runtime/drape.py`. A row of vectors is [N, 3, n], of scalars [N, 1, n], for N characters.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.export.onnx_graph import Graph
+from clothjax.networks import psi
+from clothjax.networks.forces import KINDS
+from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
+from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
+
+DRAPE = ("change", "garment", "position", "velocity")  # of the state, beside `latent` and `history`
+AXES = ([1, 2, 0], [2, 0, 1])
+
+
+class Parts(NamedTuple):
+    """What a model with forces has, checked to be there."""
+
+    predictor: ForcePredictor
+    cloth: Cloth
+    felt: Shown
+    template: np.ndarray  # [3, V] m, of the garment that feels
+
+
+def parts(model: Model) -> Parts:
+    """Return the parts of a model with forces.
+
+    Raises:
+        ValueError: if its body has pose blend shapes.
+    """
+    predictor, cloth = model.network.predictor, model.wearer.cloth
+    assert isinstance(predictor, ForcePredictor) and cloth is not None
+    if predictor.corrections is not None:
+        raise ValueError("ONNX has no pose blend shapes of a body yet; export to another format")
+    felt = predictor.felt or Shown(model.network.shapes, model.network.weights)
+    template = model.wearer.template if cloth.template is None else cloth.template
+    return Parts(predictor, cloth, felt, np.asarray(template))
+
+
+def shapes(model: Model) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of `DRAPE` by name, without the leading axis."""
+    vertices = len(parts(model).cloth.mass)
+    return dict(zip(DRAPE, ((len(model.network.first),), (3, vertices), (vertices, 3), (vertices, 3)), strict=True))
+
+
+def blended(g: Graph, transforms: str, weights: np.ndarray) -> str:
+    """Return transforms [N, 3, 4, V] of vertices with weights [J', V], from those [N, J', 12] of the joints."""
+    rows = g("MatMul", g("Transpose", transforms, perm=[0, 2, 1]), np.asarray(weights))
+    return g.reshape(rows, 3, 4, np.shape(weights)[1])
+
+
+def moved(g: Graph, rows: str, points: str) -> str:
+    """Return points [N, 3, V] moved by transforms [N, 3, 4, V]."""
+    turned = g("Mul", g.slice(rows, 2, 0, 3), g("Unsqueeze", points, np.array([1], np.int64)))
+    turned = g("ReduceSum", turned, np.array([2], np.int64), keepdims=0)
+    return g("Add", turned, g("Squeeze", g.slice(rows, 2, 3, 4), np.array([2], np.int64)))
+
+
+def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) -> str:
+    """Return the next code [N, L], not yet clipped.
+
+    Args:
+        rows: transforms [N, 3, 4, V] of the garment that feels, at the next frame.
+        transforms: [N, J', 12] of the joints.
+        advance: [N, 3, 1] m, the root's step.
+    """
+    it = parts(model)
+    held = g("Add", moved(g, rows, "garment"), advance)
+    kinds = [
+        _momentum(g, model, it, held),
+        _elasticity(g, model, it, held),
+        _contact(g, model, it, held, transforms, advance),
+    ]
+    on_vertices = g("Concat", *(g("Unsqueeze", kind, np.array([1], np.int64)) for kind in kinds), axis=1)
+    turned = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
+    carried_back = g("Mul", turned, g("Unsqueeze", on_vertices, np.array([3], np.int64)))
+    carried_back = g("ReduceSum", carried_back, np.array([2], np.int64), keepdims=0)  # [N, kinds, 3, V]
+    flat = g.reshape(carried_back, len(KINDS), int(np.prod(it.template.shape)))
+    pulls = _pulled_back(g, model, g("MatMul", flat, np.asarray(it.felt.shapes).T))
+    return _predicted(g, model, it, pulls)
+
+
+def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance: str) -> str:
+    """Name the next state of the garment; return its positions [N, 3, V] m, relative to the root's new place.
+
+    Args:
+        latent: [N, L] the next code.
+        garment: [N, 3 V] m, its garment in the canonical pose.
+        rows, advance: as of `next_code`.
+    """
+    vertices = len(parts(model).cloth.mass)
+    g("Sub", latent, "latent", name="next_change")
+    canonical = g("Reshape", garment, np.array([0, 3, vertices], np.int64), name="next_garment")
+    placed = moved(g, rows, canonical)
+    position = g("Transpose", placed, perm=[0, 2, 1], name="next_position")
+    g("Sub", g("Add", position, g("Transpose", advance, perm=[0, 2, 1])), "position", name="next_velocity")
+    return placed
+
+
+def _momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
+    timestep = 1.0 / model.config.fps
+    weight = 0.0 if "gravity" in model.config.physics.without else GRAVITY
+    pushed = g("Mul", g.reshape("external", 1, 3), np.float32(timestep**2))
+    flown = g("Add", g("Add", "position", "velocity"), pushed)
+    apart = g("Sub", g("Transpose", flown, perm=[0, 2, 1]), held)
+    down = np.array([[0.0], [-weight], [0.0]])
+    return g("Mul", g("Add", g("Mul", apart, np.float32(1.0 / timestep**2)), down), np.asarray(it.cloth.mass))
+
+
+def _elasticity(g: Graph, model: Model, it: Parts, held: str) -> str:
+    """Elastic forces [N, 3, V] in N, as of `elastic_forces.elastic`."""
+    mesh, vertices = it.predictor.mesh, it.template.shape[1]
+    gradients = _stretching(g, it, held, np.asarray(mesh.faces))
+    corners = [np.asarray(mesh.faces).T.reshape(-1), np.asarray(mesh.hinges).T.reshape(-1)]
+    if "bending" in model.config.physics.without:
+        corners = corners[:1]
+    else:
+        gradients += _bending(g, it, held, np.asarray(mesh.hinges))
+    corners = np.concatenate(corners)
+    # a sum over a table: the elements of each vertex, padded with one that is zero
+    order, counts = np.argsort(corners, kind="stable"), np.bincount(corners, minlength=vertices)
+    table = np.full((vertices, counts.max()), len(corners))
+    table[np.repeat(np.arange(vertices), counts), np.concatenate([np.arange(count) for count in counts])] = order
+    rows = g("Pad", g("Concat", *gradients, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
+    gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 3, *table.shape)
+    return g("Neg", g("ReduceSum", gathered, np.array([3], np.int64), keepdims=0))
+
+
+def _stretching(g: Graph, it: Parts, held: str, faces: np.ndarray) -> list[str]:
+    """Gradients [N, 3, F] of the stretching energy for the three corners."""
+    rest, material = it.cloth.rest, it.cloth.material
+    a, b, c, d = np.asarray(rest.inverse).reshape(-1, 4).T
+    size = np.asarray(rest.face_area) * THICKNESS
+    stiff, lam = 2.0 * float(material.mu) * size, float(material.lam) * size
+    corners = [g("Gather", held, faces[:, k], axis=2) for k in range(3)]
+    first, second = (g("Sub", corners[k], corners[2]) for k in range(2))
+    along = g("Add", g("Mul", first, a), g("Mul", second, c))
+    across = g("Add", g("Mul", first, b), g("Mul", second, d))
+    one = np.float32(1.0)
+    stretch = [g("Mul", g("Sub", _dot(g, x, x), one), np.float32(0.5)) for x in (along, across)]
+    shear = g("Mul", _dot(g, along, across), 0.5 * stiff)
+    trace = g("Mul", g("Add", *stretch), lam)
+    of_along, of_across = (g("Add", g("Mul", x, stiff), trace) for x in stretch)
+    left = g("Add", g("Mul", of_along, along), g("Mul", shear, across))
+    right = g("Add", g("Mul", shear, along), g("Mul", of_across, across))
+    first = g("Add", g("Mul", left, a), g("Mul", right, b))
+    second = g("Add", g("Mul", left, c), g("Mul", right, d))
+    return [first, second, g("Neg", g("Add", first, second))]
+
+
+def _bending(g: Graph, it: Parts, held: str, hinges: np.ndarray) -> list[str]:
+    """Gradients [N, 3, H] of the bending energy for the edge's ends and the two vertices opposite."""
+    rest = it.cloth.rest
+    start, end, *opposite = (g("Gather", held, hinges[:, k], axis=2) for k in range(4))
+    edge, left, right = (g("Sub", x, start) for x in (end, *opposite))
+    normals = [_cross(g, edge, left), _cross(g, right, edge)]
+    squared, *sides = (_dot(g, x, x) for x in (edge, left, right))
+    squares = [_dot(g, x, x) for x in normals]
+    size = g("Max", squared, *sides)
+    bent = g("Greater", g("Min", *squares), g("Mul", g("Mul", size, size), np.float32(SLIVER**2)))
+    one = np.float32(1.0)
+    squared, *squares = (g("Where", bent, x, one) for x in (squared, *squares))
+    length = g("Sqrt", squared)
+    sine, cosine = _dot(g, _cross(g, *normals), edge), g("Mul", _dot(g, *normals), length)
+    # twice the arc of half the angle: there is no arctan2
+    radius = g("Sqrt", g("Add", g("Mul", sine, sine), g("Mul", cosine, cosine)))
+    half = g("Div", sine, g("Max", g("Add", radius, cosine), np.float32(1e-30)))
+    angle = g("Sub", g("Mul", g("Atan", half), np.float32(2.0)), np.asarray(rest.hinge_angle))
+    stiff = float(it.cloth.material.bending) / (4.0 * np.asarray(rest.hinge_area))
+    weight = g("Mul", g("Cast", bent, to=g.onnx.TensorProto.FLOAT), stiff)
+    torque = g("Mul", g("Mul", g("Mul", weight, squared), angle), length)
+    tips = [g("Mul", g("Neg", g("Div", torque, x)), y) for x, y in zip(squares, normals, strict=True)]
+    places = [g("Div", _dot(g, x, edge), squared) for x in (left, right)]
+    longer = g("Mul", g("Mul", weight, g("Mul", angle, angle)), edge)
+    at_end = g("Neg", g("Add", *(g("Mul", x, y) for x, y in zip(places, tips, strict=True))))
+    at_start = g("Neg", g("Add", at_end, g("Add", *tips)))
+    return [g("Sub", at_start, longer), g("Add", at_end, longer), *tips]
+
+
+def _contact(g: Graph, model: Model, it: Parts, held: str, transforms: str, advance: str) -> str:
+    """Forces [N, 3, V] in N of the planes of the nearest candidates, as of `forces.felt`."""
+    predictor, cloth, physics = it.predictor, it.cloth, model.config.physics
+    candidates = np.asarray(predictor.scales.candidates)
+    vertices, count = candidates.shape
+    rows = blended(g, transforms, np.asarray(predictor.body))
+    body = g("Add", moved(g, rows, g.constant(np.asarray(cloth.body).T[None])), advance)
+    corners = [g("Gather", body, np.asarray(predictor.faces)[:, k], axis=2) for k in range(3)]
+    centres = g("Mul", g("Add", g("Add", corners[0], corners[1]), corners[2]), np.float32(1.0 / 3.0))
+    normals = _cross(g, *(g("Sub", corner, corners[0]) for corner in corners[1:]))
+    length = g("Sqrt", g("Max", _dot(g, normals, normals), np.float32(1e-30)))
+    normals = g("Div", normals, length)
+    near = g.reshape(g("Gather", centres, candidates.reshape(-1), axis=2), 3, vertices, count)
+    apart = g("Sub", g("Unsqueeze", held, np.array([3], np.int64)), near)
+    distance = g("ReduceSumSquare", apart, axes=[1], keepdims=0)
+    nearest = g("ArgMin", distance, axis=2, keepdims=1)
+    every = g("Add", g("Mul", nearest, np.int64(0)), candidates[None].astype(np.int64))  # [N, V, K]
+    face = g("GatherElements", every, nearest, axis=2)  # [N, V, 1]
+    face = g("Transpose", face, perm=[0, 2, 1])
+    face = g("Concat", face, face, face, axis=1)
+    point, normal = (g("GatherElements", x, face, axis=2) for x in (centres, normals))
+    gap = _dot(g, g("Sub", held, point), normal)
+    depth = g("Relu", g("Sub", np.float32(physics.collision_offset), gap))
+    return g("Mul", g("Mul", g("Mul", depth, depth), np.float32(3.0 * physics.collision_stiffness)), normal)
+
+
+def _pulled_back(g: Graph, model: Model, on_weights: str) -> str:
+    """Return forces [N, kinds, L] on whitened codes, from those [N, kinds, K] on the weights of the blend shapes."""
+    network, config = model.network, model.config.model
+    read, width = network.read, network.width
+    assert isinstance(read, Layer) and isinstance(network.predictor, ForcePredictor)
+    last = len(network.decoder) - 1
+    before = [g("Add", g("MatMul", "latent", read.kernel), read.bias)]
+    before, skip = ([before[0]], None) if len(read.bias) == width else (
+        [g.slice(before[0], 1, 0, width)], g.slice(before[0], 1, width, len(read.bias))
+    )  # fmt: skip
+    for number, layer in enumerate(network.decoder):
+        if number < last or config.blendshape_relu:
+            before.append(g("Add", g("MatMul", g("Relu", before[-1]), layer.kernel), layer.bias))
+    force = on_weights
+    if network.mix is not None:
+        force = g("MatMul", force, np.asarray(network.mix.kernel).T)
+    if config.blendshape_relu:
+        weights = before.pop()
+        force = _masked(g, force, weights if skip is None else g("Add", weights, skip))
+    of_skip = force
+    for layer in reversed(network.decoder):
+        force = _masked(g, g("MatMul", force, np.asarray(layer.kernel).T), before.pop())
+    whole = force if skip is None else g("Concat", force, of_skip, axis=2)
+    back = np.asarray(network.predictor.scales.whitening.back, np.float64)
+    return g("MatMul", whole, np.asarray(read.kernel, np.float64).T @ back)
+
+
+def _masked(g: Graph, force: str, before: str) -> str:
+    """Return forces [N, kinds, n] where a ReLU of values [N, n] lets them through."""
+    open_ = g("Cast", g("Greater", before, np.float32(0.0)), to=g.onnx.TensorProto.FLOAT)
+    return g("Mul", force, g("Unsqueeze", open_, np.array([1], np.int64)))
+
+
+def _predicted(g: Graph, model: Model, it: Parts, pulls: str) -> str:
+    """Return the next code [N, L] from the forces [N, kinds, L] on whitened codes, as `psi.next_code`."""
+    scales, params, size = it.predictor.scales, it.predictor.params, len(model.network.first)
+    inputs = (2 + len(KINDS)) * size
+    change = g("MatMul", "change", np.asarray(scales.whitening.to))
+    seen = g("Concat", "latent", change, g.reshape(pulls, len(KINDS) * size), axis=1)
+    spread = psi.BOUND * np.asarray(scales.spread)[:inputs]
+    seen = g("Tanh", g("Div", g("Sub", seen, np.asarray(scales.middle)[:inputs]), spread))
+    seen = g("Mul", seen, np.float32(psi.BOUND))
+    constants = np.asarray(psi.scaled_inputs(scales, jnp.pad(it.cloth.constants, (inputs, 0))))[inputs:]
+
+    def reading(layer: dict) -> Layer:
+        kernel = np.asarray(layer["kernel"])
+        return Layer(kernel[:inputs], np.asarray(layer["bias"]) + constants @ kernel[inputs:])
+
+    x = g.layer(seen, reading(params["mlp"]["dense_0"]))
+    for number in range(1, len(params["mlp"])):
+        layer = params["mlp"][f"dense_{number}"]
+        x = g.layer(g("Relu", x), Layer(layer["kernel"], layer["bias"]))
+    moved_by = g("Add", g.layer(seen, reading(params["linear"])), x)
+    return g("Add", "latent", g("MatMul", moved_by, np.asarray(scales.output) * np.asarray(scales.whitening.back)))
+
+
+def _dot(g: Graph, a: str, b: str) -> str:
+    return g("ReduceSum", g("Mul", a, b), np.array([1], np.int64), keepdims=1)
+
+
+def _cross(g: Graph, a: str, b: str) -> str:
+    turned = [[g("Gather", x, np.array(axes, np.int64), axis=1) for axes in AXES] for x in (a, b)]
+    return g("Sub", g("Mul", turned[0][0], turned[1][1]), g("Mul", turned[0][1], turned[1][0]))
