@@ -6,20 +6,21 @@ import re
 import shlex
 import subprocess
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 import trimesh
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 from toy import small
 
 from clothjax.config import Config, PeerConfig
 from clothjax.geometry import topology
-from clothjax.networks import decoder, psi
-from clothjax.networks.normalisation import Normalizers, Scale
+from clothjax.networks import decoder, forces, mlp, psi
+from clothjax.networks.normalisation import ForceScales, Normalizers, Scale
 from clothjax.physics import energies
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.runtime import inference, models
@@ -333,6 +334,59 @@ def random_model(skip, excluded=()):
         normalizers,
         betas=np.ones(10),
     )
+
+
+class ForcePsi(NamedTuple):
+    """A random Psi with forces: the experiment, its decoder, predictor and scales."""
+
+    experiment: assembly.Experiment
+    garment: dict
+    predictor: dict
+    scales: ForceScales
+
+    def model(self, **character):
+        """Return the model of a character."""
+        it = self.experiment
+        return models.build(
+            it.config, it.garment, it.body, it.names, self.garment, self.predictor, self.scales, **character
+        )
+
+
+def random_force_psi(skip=True, **physics):
+    """A random Psi with forces whose code decays, with either a skip or a ReLU on the weights."""
+    config = small()
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, decoder=(24, 16), decoder_skip=skip, blendshape_relu=not skip),
+        stage2=dataclasses.replace(config.stage2, forces=True, hidden=(32, 24)),
+        physics=dataclasses.replace(config.physics, **physics),
+    )
+    experiment = assembly.assemble(config)
+    scene, size, rng = experiment.scene, 40, np.random.default_rng(0)
+    basis = 0.05 * laplacian_shapes.laplacian(scene, config)
+    garment = decoder.init(jax.random.key(0), size, basis, config.model)
+    last = garment["decoder"]["dense_2"]
+    last |= {
+        "kernel": 500 * last["kernel"],
+        "bias": jnp.asarray(0.1 * rng.normal(size=last["bias"].shape), jnp.float32),
+    }
+    mixed = rng.normal(size=(size, size))
+    whitening = forces.whitening(0.01 * (mixed @ mixed.T / size + 0.1 * np.eye(size)))
+    body = np.asarray(scene.body.vertices)[np.asarray(scene.body.faces)].mean(axis=1)
+    candidates = KDTree(body).query(np.asarray(scene.garment.vertices), 5)[1].astype(np.int32)
+    count = (2 + len(forces.KINDS)) * size + 14
+    network = psi.ForcePsi(config.stage2, size)
+    predictor = mlp.init(network, jax.random.key(1), jnp.zeros(count))
+    spread, output = np.repeat([1.0, 1.0, 0.02, 0.02, 3.0, 1.0], [size] * 5 + [14]), 0.3
+    kernel = 0.3 * rng.normal(size=predictor["linear"]["kernel"].shape) / np.sqrt(count)
+    kernel[:size] = -0.3 / output * whitening.to
+    predictor["linear"] |= {"kernel": jnp.asarray(kernel, jnp.float32)}
+    predictor["mlp"]["dense_2"] |= {"kernel": 300 * predictor["mlp"]["dense_2"]["kernel"]}
+    scales = ForceScales(
+        *(jnp.asarray(x, jnp.float32) for x in (0.1 * rng.normal(size=count), spread, output)),
+        whitening, *(jnp.full(size, x, jnp.float32) for x in (-5.0, 5.0)), candidates,
+    )  # fmt: skip
+    return ForcePsi(experiment, garment, predictor, scales)
 
 
 def apart(found, model, motion):

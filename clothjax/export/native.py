@@ -279,6 +279,19 @@ class Psi:
         arguments = (self._model, self._state, *map(_pointer, pose), vertices_out)
         return lambda: self._c.psi_step(*arguments)
 
+    def state(self) -> np.ndarray:
+        """Return what goes on from frame to frame, as `psi_keep` orders it."""
+        carried = np.zeros(self._c.psi_carried(self._model), np.float32)
+        self._c.psi_keep(self._model, self._state, _pointer(carried))
+        return carried
+
+    def push(self, external: Array) -> bool:
+        """Set the external acceleration [3] m/s^2 of the frames to come; return whether the model feels it."""
+        row = np.ascontiguousarray(external, np.float32)
+        if row.shape != (3,):
+            raise ValueError(f"an external acceleration is [3], not {row.shape}")
+        return bool(self._c.psi_push(self._model, self._state, _pointer(row)))
+
     def _pose(self, rotations: Array, translation: Array) -> tuple[np.ndarray, np.ndarray]:
         pose = (np.ascontiguousarray(rotations, np.float32), np.ascontiguousarray(translation, np.float32))
         if pose[0].shape != (self.joints, 3, 3) or pose[1].shape != (3,):

@@ -23,8 +23,9 @@ STATE = {
 STATE_WITH_FORCES = {
     "state": "feed what is called next_NAME back as NAME",
     "external": "an acceleration of the cloth beside gravity, m/s^2, such as wind; zeros for none",
-    "first_state": "zeros, but for both rows of history: the rotations of the first pose, one after the other, its "
-    f"translation, and zeros. Run {SETTLING} times with the first pose: the garment has settled",
+    "first_state": f"{STATE['first_state']}. All else of the state is zeros. Then run `settling` times with that pose, "
+    "feeding the state back: the garment settles",
+    "settling": SETTLING,
 }
 
 

@@ -59,7 +59,7 @@ def _bending(corners: list[Vector], rest: Rest, material: Material) -> tuple[Vec
     squares = [_dot(normal, normal) for normal in normals]
     squared = _dot(edge, edge)
     size = jnp.maximum(jnp.maximum(squared, _dot(left, left)), _dot(right, right))
-    flat = jnp.minimum(*squares) < SLIVER * SLIVER * size * size
+    flat = ~(jnp.minimum(*squares) > SLIVER * SLIVER * size * size)
     squared, squares = jnp.where(flat, 1.0, squared), [jnp.where(flat, 1.0, square) for square in squares]
     length = jnp.sqrt(squared)
     sine, cosine = _dot(_cross(*normals), edge), _dot(*normals) * length

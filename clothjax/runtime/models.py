@@ -178,7 +178,7 @@ def build(
     names: tuple[str, ...],
     garment_params: dict,
     predictor: dict,
-    normalizers: Normalizers,
+    normalizers: Normalizers | ForceScales,
     *,
     betas: Array | None = None,
     material: Material | None = None,
@@ -191,7 +191,7 @@ def build(
         garment, body, names: as loaded by `storage`; names [J] of the joints.
         garment_params: parameters of the decoder with its blend shapes.
         predictor: parameters of the latent predictor.
-        normalizers: scales of its codes and pose inputs.
+        normalizers: scales of its codes and inputs.
         betas: [S] body shape; default the mean body.
         material: default the configured one.
 

@@ -9,26 +9,38 @@ export class Garment {
     return new this.ort.Tensor("float32", Float32Array.from(values), this.about.shapes[name]);
   }
 
+  // The cloth's acceleration beside gravity in the frames to come, [3] m/s^2: only of a garment with forces.
+  external = [0, 0, 0];
+
   // rotations [J * 9] row-major and local, translation [3] m
   async run(rotations, translation) {
-    const pose = { rotations: this.tensor("rotations", rotations), translation: this.tensor("translation", translation) };
-    return this.session.run({ ...this.state, ...pose });
+    const given = { rotations: this.tensor("rotations", rotations), translation: this.tensor("translation", translation) };
+    if (this.about.shapes.external) given.external = this.tensor("external", this.external);
+    return this.session.run({ ...this.state, ...given });
+  }
+
+  // The names of the state: what comes back as next_NAME.
+  names() {
+    return Object.keys(this.about.shapes).filter((name) => `next_${name}` in this.about.shapes);
   }
 
   // The character has been standing in this pose: about.first_state.
   async stand(rotations, translation) {
-    const first = this.tensor("latent", this.about.first_latent);
-    const size = this.about.shapes.history.reduce((a, b) => a * b, 1);
-    this.state = { latent: first, history: this.tensor("history", new Float32Array(size)) };
+    const size = (name) => this.about.shapes[name].reduce((a, b) => a * b, 1);
+    const zeros = (name) => this.tensor(name, new Float32Array(size(name)));
+    const first = Object.fromEntries(this.names().map((name) => [name, zeros(name)]));
+    first.latent = this.tensor("latent", this.about.first_latent);
+    this.state = first;
     const { next_history } = await this.run(rotations, translation);
-    const newest = next_history.data.slice(0, size / 2);
-    this.state = { latent: first, history: this.tensor("history", [...newest, ...newest]) };
+    const newest = next_history.data.slice(0, size("history") / 2);
+    this.state = { ...first, history: this.tensor("history", [...newest, ...newest]) };
+    for (let i = 0; i < (this.about.settling ?? 0); i++) await this.step(rotations, translation);
   }
 
   // Vertices [V * 3] m of the next frame.
   async step(rotations, translation) {
     const result = await this.run(rotations, translation);
-    this.state = { latent: result.next_latent, history: result.next_history };
+    this.state = Object.fromEntries(this.names().map((name) => [name, result[`next_${name}`]]));
     return result.vertices.data;
   }
 }

@@ -16,10 +16,14 @@
 
 #include "onnxruntime_c_api.h"
 
-enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS };
-enum { NEXT_LATENT, NEXT_HISTORY, OK, VERTICES, OUTPUTS };
-static const char *const inputs[INPUTS] = {"latent", "history", "rotations", "translation"};
-static const char *const outputs[OUTPUTS] = {"next_latent", "next_history", "ok", "vertices"};
+enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS, MORE = 5 };
+enum { NEXT_LATENT, NEXT_HISTORY, OK, OUTPUTS = 4 };
+/* a garment with forces has four more arrays in its state, and is pushed by an external acceleration */
+static const char *const inputs[INPUTS + MORE] = {"latent", "history", "rotations", "translation", "change", "garment",
+                                                  "position", "velocity", "external"};
+static const char *const plain[OUTPUTS] = {"next_latent", "next_history", "ok", "vertices"};
+static const char *const forced[OUTPUTS + MORE - 1] = {"next_latent", "next_history", "ok", "next_change",
+                                                       "next_garment", "next_position", "next_velocity", "vertices"};
 
 static const OrtApi *ort;
 
@@ -65,14 +69,22 @@ static void read_array(const char *path, const char *name, float *to, size_t cou
     if (fread(text, 1, (size_t)size, file) != (size_t)size) fail(path, "cannot be read");
     fclose(file);
     char *at = strstr(text, name);
-    at = at ? strchr(at, '[') : NULL;
+    at = at ? strpbrk(at + strlen(name), "[0123456789") : NULL;
+    if (at && *at != '[') at--; /* a number alone */
     for (size_t i = 0; i < count; i++) {
         char *end = at;
         if (at) to[i] = strtof(at + 1, &end);
-        if (!at || end == at + 1) fail(path, "has no whole first_latent");
+        if (!at || end == at + 1) fail(path, "lacks part of the first state");
         at = end;
     }
     free(text);
+}
+
+/* The next state is that of the frame to come. */
+static void go_on(tensor *in, const tensor *out, int forces) {
+    memcpy(in[LATENT].data, out[NEXT_LATENT].data, in[LATENT].bytes);
+    memcpy(in[HISTORY].data, out[NEXT_HISTORY].data, in[HISTORY].bytes);
+    for (int i = 0; forces && i < MORE - 1; i++) memcpy(in[INPUTS + i].data, out[OK + 1 + i].data, in[INPUTS + i].bytes);
 }
 
 static double microseconds(void) {
@@ -100,19 +112,28 @@ int main(int count, char **arguments) {
     check(ort->CreateSession(env, arguments[1], options, &session));
     check(ort->CreateCpuMemoryInfo(OrtDeviceAllocator, OrtMemTypeDefault, &memory));
 
-    tensor in[INPUTS], out[OUTPUTS];
-    for (int i = 0; i < INPUTS; i++) {
+    size_t given_count, found_count;
+    check(ort->SessionGetInputCount(session, &given_count));
+    check(ort->SessionGetOutputCount(session, &found_count));
+    const int forces = given_count == INPUTS + MORE, given_all = forces ? INPUTS + MORE : INPUTS;
+    const int found_all = forces ? OUTPUTS + MORE - 1 : OUTPUTS;
+    const char *const *outputs = forces ? forced : plain;
+    if (given_count != (size_t)given_all || found_count != (size_t)found_all) fail(arguments[1], "is of another kind");
+    tensor in[INPUTS + MORE], out[OUTPUTS + MORE - 1];
+    const OrtValue *given[INPUTS + MORE];
+    OrtValue *found[OUTPUTS + MORE - 1];
+    for (int i = 0; i < given_all; i++) {
         OrtTypeInfo *type;
         check(ort->SessionGetInputTypeInfo(session, i, &type));
         in[i] = make(type, memory);
+        given[i] = in[i].value;
     }
-    for (int i = 0; i < OUTPUTS; i++) {
+    for (int i = 0; i < found_all; i++) {
         OrtTypeInfo *type;
         check(ort->SessionGetOutputTypeInfo(session, i, &type));
         out[i] = make(type, memory);
+        found[i] = out[i].value;
     }
-    const OrtValue *given[INPUTS] = {in[0].value, in[1].value, in[2].value, in[3].value};
-    OrtValue *found[OUTPUTS] = {out[0].value, out[1].value, out[2].value, out[3].value};
 
     const size_t stem = strlen(arguments[1]) - strlen(".onnx");
     if (strlen(arguments[1]) < 6 || strcmp(arguments[1] + stem, ".onnx")) fail(arguments[1], "is not called .onnx");
@@ -122,23 +143,28 @@ int main(int count, char **arguments) {
     if (!motion || !shown) fail(motion ? arguments[3] : arguments[2], "cannot be opened");
 
     double *taken = NULL;
+    float settling = 0;
     size_t frames = 0;
     while (fread(in[ROTATIONS].data, in[ROTATIONS].bytes, 1, motion) == 1 &&
            fread(in[TRANSLATION].data, in[TRANSLATION].bytes, 1, motion) == 1) {
         if (!frames) { /* the character has been standing in the first pose: "first_state" in the JSON */
             const size_t half = in[HISTORY].bytes / 2;
             read_array(about, "\"first_latent\"", in[LATENT].data, in[LATENT].bytes / sizeof(float));
-            check(ort->Run(session, NULL, inputs, given, INPUTS, outputs, OUTPUTS, found));
+            check(ort->Run(session, NULL, inputs, given, given_all, outputs, found_all, found));
             memcpy(in[HISTORY].data, out[NEXT_HISTORY].data, half);
             memcpy((char *)in[HISTORY].data + half, out[NEXT_HISTORY].data, half);
+            if (forces) read_array(about, "\"settling\"", &settling, 1);
+            for (int i = 0; i < (int)settling; i++) {
+                check(ort->Run(session, NULL, inputs, given, given_all, outputs, found_all, found));
+                go_on(in, out, forces);
+            }
         }
         const double began = microseconds();
-        check(ort->Run(session, NULL, inputs, given, INPUTS, outputs, OUTPUTS, found));
-        memcpy(in[LATENT].data, out[NEXT_LATENT].data, in[LATENT].bytes);
-        memcpy(in[HISTORY].data, out[NEXT_HISTORY].data, in[HISTORY].bytes);
+        check(ort->Run(session, NULL, inputs, given, given_all, outputs, found_all, found));
+        go_on(in, out, forces);
         taken = realloc(taken, (frames + 1) * sizeof *taken);
         taken[frames++] = microseconds() - began;
-        if (fwrite(out[VERTICES].data, out[VERTICES].bytes, 1, shown) != 1) fail(arguments[3], "cannot be written");
+        if (fwrite(out[found_all - 1].data, out[found_all - 1].bytes, 1, shown) != 1) fail(arguments[3], "cannot be written");
     }
     if (!frames) fail(arguments[2], "has no whole frame");
     qsort(taken, frames, sizeof *taken, order);

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from samples import ROOT, apart, random_model
-from toy import small
+from samples import ROOT, apart, random_force_psi, random_model
+from toy import assert_same, small
 
 from clothjax.body import skinning
 from clothjax.commands import convert
-from clothjax.export import litert, native, onnx, safetensors, stablehlo
+from clothjax.export import litert, native, onnx, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.runtime import inference, specialise
-from clothjax.types import Pose
+from clothjax.types import Motion, Pose
 
 
 def test_onnx_is_the_model_in_closed_loop(model, motion, tmp_path):
@@ -270,6 +270,56 @@ def test_safetensors_of_format_1_are_read(model, motion, tmp_path):
     save_file(arrays, str(tmp_path / "old.safetensors"), metadata=about)
     again = safetensors.from_safetensors(tmp_path / "old.safetensors")
     np.testing.assert_array_equal(inference.animate(again, motion)[0], inference.animate(model, motion)[0])
+
+
+@pytest.fixture(scope="module")
+def forced():
+    """Models of a random Psi with forces: with a skip, with a ReLU on the weights, and small on another mesh."""
+    skip, relu = random_force_psi(), random_force_psi(skip=False)
+    mesh = specialise.on_mesh(skip.model(), skip.experiment.garment, np.zeros(10))
+    few = specialise.specialise(relu.model(betas=np.ones(10)), blendshapes=7)
+    return {
+        "skip": skip.model(),
+        "relu": relu.model(betas=np.ones(10)),
+        "mesh": specialise.specialise(mesh),
+        "few": few,
+    }
+
+
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few"])
+def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
+    model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
+    found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)
+    assert apart(found, model, clip).max() < 2e-4
+    several = onnx.to_onnx(model, tmp_path / "n.onnx", batch=None, output="none")
+    names = {x.name for x in session(several).get_outputs()}
+    assert {"next_garment", "next_velocity", "ok"} <= names and "vertices" not in names
+
+
+def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):
+    model = forced["skip"]
+    run = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=2))
+    first, pose = (Pose(jnp.asarray(motion.rotations[t]), jnp.asarray(motion.translation[t])) for t in (0, 1))
+    names = (*onnx.STATE, *onnx_forces.DRAPE, *onnx.POSE)
+    given = (*onnx.first_state(model, first, 2), *(np.repeat(np.asarray(x)[None], 2, axis=0) for x in pose))
+    external = np.array([[0, 0, 0], [50, 10, -30]], np.float32)
+    (found,) = run.run(["vertices"], dict(zip(names, given)) | {"external": external})
+    state = inference.initial_state(model, first)
+    for i in range(2):
+        _, expected = inference.step(model, state, pose, external=jnp.asarray(external[i]))
+        np.testing.assert_allclose(found[i], expected, atol=1e-5)
+    assert np.abs(found[0] - found[1]).max() > 1e-4
+
+
+def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
+    clip = Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
+    for model in (forced["relu"], forced["mesh"]):
+        path = stablehlo.to_stablehlo(model, tmp_path / "g.shlo")
+        assert apart(stablehlo.run_stablehlo(path, model, clip), model, clip).max() < 1e-4
+        again = safetensors.from_safetensors(safetensors.to_safetensors(model, tmp_path / "g.safetensors"))
+        assert_same(again, model)
+        about = json.loads((tmp_path / "g.json").read_text())
+        assert about["arguments"]["external"] == [3] and len(about["results"]) == 10
 
 
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):

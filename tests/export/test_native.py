@@ -9,13 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from samples import ROOT, apart, random_model
+from jax.flatten_util import ravel_pytree
+from samples import ROOT, apart, random_force_psi, random_model
 
 import clothjax as cj
 from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
+from clothjax.networks import forces
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.models import Layer
+from clothjax.runtime.models import Layer, State
 from clothjax.types import Pose
 
 pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
@@ -133,6 +135,101 @@ def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
         assert psi.step(rotations[t], translation[t]) == bool(ok[t])
         np.testing.assert_array_equal(vertices[t], psi.vertices)
     assert np.asarray(same).all() and not ok[11] and ok[:11].all()
+
+
+@pytest.fixture(scope="module")
+def forced():
+    """Models of a random Psi with forces: a skip, a ReLU on the weights, and another mesh with few shapes."""
+    skip, relu = random_force_psi(), random_force_psi(skip=False)
+    mesh = specialise.on_mesh(relu.model(), relu.experiment.garment, np.zeros(10))
+    return {
+        "skip": specialise.specialise(skip.model(betas=np.ones(10))),
+        "relu": relu.model(),
+        "mesh": specialise.specialise(mesh, blendshapes=7),
+    }
+
+
+def of_eight_bits(model):
+    """The model with the predictor's matrices that a .psi has, in which alone eight bits are too few."""
+    predictor = model.network.predictor
+    (mlp, linear), size = (predictor.params[name] for name in ("mlp", "linear")), len(model.network.first)
+
+    def eight(kernel):
+        matrix, _, scale = native.eight_bits(kernel, False)
+        return jnp.asarray((scale[:, None] * matrix).T, jnp.float32)
+
+    inputs = slice(0, (2 + len(forces.KINDS)) * size)
+    first = mlp["dense_0"]["kernel"].at[inputs].set(eight(mlp["dense_0"]["kernel"][inputs]))
+    mlp = {name: layer | {"kernel": eight(layer["kernel"])} for name, layer in mlp.items()}
+    mlp["dense_0"] |= {"kernel": first}
+    linear = linear | {"kernel": linear["kernel"].at[inputs].set(eight(linear["kernel"][inputs]))}
+    network = model.network._replace(predictor=predictor._replace(params={"mlp": mlp, "linear": linear}))
+    return dataclasses.replace(model, network=network)
+
+
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh"])
+def test_c_with_forces_steps_as_the_model(forced, name, motion):
+    """From the same states, pushed and not, in the median of frames: a vertex between two faces may take the other."""
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    model = of_eight_bits(forced[name])
+    packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 0))
+    errors = []
+    for t in range(1, 10):
+        external = jnp.array([50.0, 10.0, -30.0]) if t > 5 else None
+        found, vertices = psi_ffi.step(packed, state, at(motion, t), external=external)
+        state, expected = inference.step(model, state, at(motion, t), external=external)
+        of_code = jnp.linalg.norm(found.drape.change - state.drape.change) / jnp.linalg.norm(state.drape.change)
+        moved = jnp.linalg.norm(state.drape.velocity, axis=1).mean()
+        of_rows = [
+            jnp.linalg.norm(x - y, axis=1).mean() / moved
+            for x, y in (
+                (vertices, expected),
+                (found.drape.garment.T, state.drape.garment.T),
+                (found.drape.position, state.drape.position),
+                (found.drape.velocity, state.drape.velocity),
+            )
+        ]
+        errors.append([of_code, *of_rows])
+    of_code, *of_rows = np.median(np.array(errors), axis=0)
+    assert of_code < 0.04 and max(of_rows) < 0.2  # the rows have the rounding of the shapes
+
+
+def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):
+    """Bit for bit, seen or not; and the first state has settled as in jax."""
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    model = forced["skip"]
+    packed, path = psi_ffi.pack(model), native.to_c(model, tmp_path / "g.psi")
+    seen, unseen = (native.Psi(library, path, *map(np.asarray, at(motion, 0))) for _ in range(2))
+    state = None
+    for t in range(1, 12):
+        if t == 6:
+            state = seen.state()
+        seen.step(*map(np.asarray, at(motion, t)))
+        unseen.step(*map(np.asarray, at(motion, t)), vertices=t == 11)
+        if t >= 6:
+            given = inference.initial_state(model, at(motion, 0))
+            _, restored = ravel_pytree((given[:4], given.drape))
+            history, drape = restored(jnp.asarray(state))
+            following, vertices = psi_ffi.step(packed, State(*history, given.ok, drape), at(motion, t))
+            np.testing.assert_array_equal(vertices, seen.vertices)
+            state = seen.state()
+            np.testing.assert_array_equal(ravel_pytree((following[:4], following.drape))[0], state)
+    np.testing.assert_array_equal(seen.vertices, unseen.vertices)
+
+
+def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path):
+    """Cut short anywhere, or with an index that points beyond."""
+    whole, path = native.packed(forced["mesh"]), tmp_path / "g.psi"
+    for cut in np.linspace(100, len(whole) - 64, 40).astype(int):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(ValueError, match=r"g\.psi: (a damaged \.psi|not a \.psi|the file cannot be read)"):
+            native.Psi(library, path, *map(np.asarray, at(motion, 0)))
+
+
+def at(motion, frame):
+    return Pose(*(jnp.asarray(x[frame], jnp.float32) for x in motion[:2]))
 
 
 def test_c_inside_of_jax_for_several_at_once(packed, model, motion):

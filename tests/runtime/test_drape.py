@@ -1,0 +1,166 @@
+"""A Psi with forces in use: it is the one that was trained, on every mesh, and feels what pushes it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from samples import random_force_psi, random_model
+
+import clothjax as cj
+from clothjax.evaluation import rollouts
+from clothjax.material import configured_material
+from clothjax.networks import animators, normalisation
+from clothjax.physics.energies import GRAVITY
+from clothjax.runtime import inference, models, specialise, trained
+from clothjax.simulation import assembly, characters, rollout
+from clothjax.types import ClothState, Material, Motion, Pose
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def forced():
+    return random_force_psi()
+
+
+@pytest.fixture(scope="module")
+def model(forced):
+    return forced.model(betas=np.linspace(-1, 1, 10))
+
+
+@pytest.fixture(scope="module")
+def motion(forced):
+    clip = assembly.motion(forced.experiment, "dance_3")
+    return Motion(clip.rotations[:FRAMES], clip.translation[:FRAMES].astype(np.float32), clip.fps)
+
+
+def pose(motion, frame):
+    return Pose(jnp.asarray(motion.rotations[frame], jnp.float32), jnp.asarray(motion.translation[frame]))
+
+
+def test_it_is_the_animator_of_training(forced, model, motion):
+    """Frame by frame from the same state, over a dance."""
+    experiment = forced.experiment
+    config, scene = experiment.config, experiment.scene
+    character = characters.dress(
+        scene, jnp.linspace(-1, 1, 10), jax.tree.map(jnp.float32, configured_material(config)), config.physics
+    )
+    make = animators.force_psi_animator(forced.garment, forced.scales)
+    animator = make({"params": forced.predictor}, scene, character, config)
+    windows = rollouts.windows(motion)
+    advance = jax.jit(lambda state, poses: rollout.advance(animator, scene, character, state, poses, config)[0])
+    state, moved = inference.initial_state(model, pose(motion, 1)), []
+    for frame in range(FRAMES - 2):
+        hung = state.drape
+        before = ClothState(hung.position, hung.velocity, 0 * hung.velocity, state.latent, hung.change)
+        expected = advance(before, jax.tree.map(lambda x, frame=frame: x[frame], windows))
+        state, _ = inference.step(model, state, pose(motion, frame + 2))
+        np.testing.assert_allclose(state.latent, expected.latent, atol=2e-5)
+        np.testing.assert_allclose(state.drape.position, expected.position, atol=2e-5)
+        np.testing.assert_allclose(state.drape.velocity, expected.velocity, atol=2e-5)
+        moved.append(np.abs(state.drape.change).max())
+    assert min(moved) > 1e-3  # it does not merely hold the code
+
+
+def test_vertices_are_its_garment_in_the_world(model, motion):
+    state = inference.initial_state(model, pose(motion, 0))
+    state, vertices = inference.step(model, state, pose(motion, 1))
+    np.testing.assert_allclose(vertices, state.drape.position + motion.translation[1][None], atol=1e-6)
+    unseen, nothing = inference.step(model, inference.initial_state(model, pose(motion, 0)), pose(motion, 1), False)
+    assert nothing is None
+    np.testing.assert_allclose(unseen.latent, state.latent, atol=1e-6)
+
+
+def test_an_acceleration_against_gravity_is_no_gravity(forced, motion):
+    """And one aside moves the cloth aside."""
+    model, light = forced.model(), random_force_psi(without=("gravity",)).model()
+    first = inference.initial_state(light, pose(motion, 0))
+    free = inference.step(light, first, pose(motion, 1))[1]
+    held = inference.step(model, first, pose(motion, 1), external=jnp.array([0.0, GRAVITY, 0.0]))[1]
+    falls = inference.step(model, first, pose(motion, 1))[1]
+    np.testing.assert_allclose(held, free, atol=1e-6)
+    assert np.abs(falls - free).max() > 1e-5
+
+
+def test_a_psi_without_forces_refuses_an_acceleration(motion):
+    model = random_model(skip=True)
+    state = inference.initial_state(model, pose(motion, 0))
+    with pytest.raises(ValueError, match=r"feels no external acceleration: it was trained without stage2\.forces"):
+        inference.step(model, state, pose(motion, 1), external=jnp.zeros(3))
+
+
+def test_a_part_and_another_mesh_feel_what_the_whole_feels(forced, model, motion):
+    whole, _ = inference.animate(model, motion)
+    vertices = np.arange(0, 500)
+    seen, _ = inference.animate(specialise.part(model, vertices), motion)
+    np.testing.assert_allclose(seen, whole[:, vertices], atol=1e-5)
+    mesh = specialise.on_mesh(model, forced.experiment.garment, np.linspace(-1, 1, 10))  # the same one, as another
+    assert mesh.network.predictor.felt is not None
+    np.testing.assert_allclose(inference.animate(mesh, motion)[0], whole, atol=1e-5)
+
+
+def test_specialised_it_is_the_same_and_with_fewer_shapes_nearly(forced, model, motion):
+    whole = np.asarray(inference.animate(model, motion)[0])
+    small = specialise.specialise(model)
+    assert len(small.moving) < len(model.moving) == small.wearer.joints.shape[0]
+    np.testing.assert_allclose(inference.animate(small, motion)[0], whole, atol=2e-5)
+    equalised, _ = inference.animate(specialise.equalised(small), motion)
+    np.testing.assert_allclose(equalised[:3], whole[:3], atol=1e-4)  # a random network magnifies rounding
+    mesh = specialise.on_mesh(model, forced.experiment.garment, np.linspace(-1, 1, 10))
+    first = inference.initial_state(model, pose(motion, 0))
+    expected, moved = (inference.step(model, first, pose(motion, frame))[1] for frame in (1, 8))
+    for each in (model, mesh):
+        few = specialise.specialise(each, blendshapes=8)
+        apart = np.abs(inference.step(few, first, pose(motion, 1))[1] - expected).mean()
+        assert 1e-6 < apart < 0.3 * np.abs(moved - expected).mean()
+
+
+def test_a_crowd_is_each_of_its_characters(forced, motion):
+    wearers = [forced.model(betas=np.full(10, i), material=Material(0.2 + 0.1 * i, 2e4, 4e4, 1e-5)) for i in range(2)]
+    poses = Pose(jnp.asarray(motion.rotations[[0, 5]], jnp.float32), jnp.asarray(motion.translation[[0, 5]]))
+    each = [inference.initial_state(model, jax.tree.map(lambda x, i=i: x[i], poses)) for i, model in enumerate(wearers)]
+    states = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    _, together = inference.step_crowd(models.crowd(wearers), states, poses)
+    for i, model in enumerate(wearers):
+        _, alone = inference.step(model, each[i], jax.tree.map(lambda x, i=i: x[i], poses))
+        np.testing.assert_allclose(together[i], alone, atol=1e-5)
+
+
+def test_it_stays_finite_whatever_comes_in(model, motion):
+    """Poses that are not numbers, a leap of a kilometre, a state that is lost."""
+    state = inference.initial_state(model, pose(motion, 0))
+    broken = pose(motion, 1)._replace(translation=jnp.array([np.nan, 0, 0]))
+    state, vertices = inference.step(model, state, broken)
+    assert np.isfinite(vertices).all() and not state.ok
+    state, vertices = inference.step(model, state, pose(motion, 1)._replace(translation=jnp.array([1e3, 0, 0])))
+    assert np.isfinite(vertices).all()
+    lost = state.drape._replace(velocity=jnp.full_like(state.drape.velocity, np.nan))
+    state, vertices = inference.step(model, state._replace(drape=lost), pose(motion, 2))
+    assert np.isfinite(vertices).all() and not state.ok
+    for frame in range(3, 8):
+        state, vertices = inference.step(model, state, pose(motion, frame))
+    assert np.isfinite(vertices).all()
+
+
+def test_resting_is_of_cloth_that_stays_where_it_is(model, motion):
+    before = inference.initial_state(model, pose(motion, 0))
+    still = before._replace(drape=before.drape._replace(velocity=0 * before.drape.velocity))
+    swings = before._replace(drape=before.drape._replace(velocity=0 * before.drape.velocity + 1e-3))
+    assert inference.resting(before, still) and not inference.resting(before, swings)
+
+
+def test_a_packed_one_is_the_same_but_for_rounding(forced, motion, tmp_path):
+    inverse = np.asarray(forced.scales.whitening.back, np.float64) @ np.asarray(forced.scales.whitening.back)
+    phi = {"params": {"garment": forced.garment, "inverse_hessian": inverse.astype(np.float32)}}
+    phi["statistics"] = {"mesh": normalisation.empty_statistics(3)}
+    trained.write(tmp_path, forced.experiment.config, phi, forced.predictor, forced.scales)
+    again = trained.psi(tmp_path).normalizers
+    np.testing.assert_array_equal(again.candidates, forced.scales.candidates)
+    assert again.candidates.dtype == np.int32
+    np.testing.assert_allclose(again.whitening.to, forced.scales.whitening.to, atol=1e-3)
+    model, packed = forced.model(), cj.load(tmp_path)
+    first = inference.initial_state(model, pose(motion, 0))
+    whole, found = (inference.step(each, first, pose(motion, 1))[0] for each in (model, packed))
+    moved = jnp.linalg.norm(whole.drape.change)
+    assert jnp.linalg.norm(found.latent - whole.latent) < 0.2 * moved  # matrices are packed in eight bits
+    assert packed.config == forced.experiment.config
