@@ -46,7 +46,8 @@ def function(model: Model) -> Callable:
     def frame(*given: Array) -> tuple:
         drape = Drape(*given[4:8]) if _with_forces(model) else None
         rotations, translation, *external = given[4 if drape is None else 8 :]
-        state = State(*given[:4], jnp.asarray(True), drape)
+        latent, before, places, translations = given[:4]
+        state = State(latent, before, places, translations, jnp.asarray(True), drape)
         following, vertices = inference.step(model, state, Pose(rotations, translation), True, *external)
         return *following[:4], *(following.drape or ()), following.ok, vertices
 

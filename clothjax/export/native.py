@@ -19,7 +19,7 @@ from clothjax.networks import psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
 from clothjax.physics.energies import GRAVITY, THICKNESS
-from clothjax.runtime.models import Bounds, FoldedLayer, ForcePredictor, Layer, Model, Shown
+from clothjax.runtime.models import Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor, Shown
 from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
@@ -53,8 +53,9 @@ def packed(model: Model) -> bytes:
 def _arrays(model: Model) -> Iterator[np.ndarray]:
     """Yield the arrays of a file in their order."""
     network, wearer, predictor = model.network, model.wearer, model.network.predictor
-    code, forced = len(network.first), isinstance(predictor, ForcePredictor)
-    hidden = _mlp(predictor)[1:] if forced else predictor.hidden
+    code, pose = len(network.first), predictor if isinstance(predictor, PosePredictor) else None
+    forced = isinstance(predictor, ForcePredictor)
+    hidden = _mlp(predictor)[1:] if isinstance(predictor, ForcePredictor) else predictor.hidden
     head = (
         MAGIC, VERSION + forced, len(model.parents), len(model.input_joints), len(model.moving),
         wearer.template.shape[1], code, len(hidden), len(network.decoder), len(network.read.bias) > network.width,
@@ -66,14 +67,14 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
         yield np.array(integers, np.int32)
     yield np.asarray(wearer.joints, np.float32)
     yield _padded(network.weights)
-    if not forced:
-        yield np.asarray(predictor.pose_mean, np.float32)
-        yield from _bounds(predictor.pose_bounds, len(predictor.pose_mean))
+    if pose is not None:
+        yield np.asarray(pose.pose_mean, np.float32)
+        yield from _bounds(pose.pose_bounds, len(pose.pose_mean))
     yield from _bounds(network.code_bounds, code)
     yield np.asarray(network.first, np.float32)
-    if not forced:
-        yield from _layer(Layer(predictor.pose, predictor.code.bias + wearer.bias), gains=True)
-        yield from _layer(predictor.code._replace(bias=np.zeros(len(wearer.bias))))
+    if pose is not None:
+        yield from _layer(Layer(pose.pose, pose.code.bias + wearer.bias), gains=True)
+        yield from _layer(pose.code._replace(bias=np.zeros(len(wearer.bias))))
     for layer in hidden:
         yield from _layer(layer)
     yield from _layer(network.read, gains=True)
@@ -82,7 +83,7 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     if network.mix is not None:
         yield from _layer(network.mix)
     yield from _layer(Layer(network.shapes, wearer.template.reshape(-1)), gains=True)
-    if forced:
+    if isinstance(predictor, ForcePredictor):
         yield from _of_forces(model, predictor)
 
 

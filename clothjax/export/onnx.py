@@ -11,7 +11,7 @@ from clothjax.export import onnx_forces, sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.models import FoldedLayer, ForcePredictor, Layer, Model
+from clothjax.runtime.models import FoldedLayer, ForcePredictor, Layer, Model, PosePredictor
 from clothjax.types import Array, Motion, Pose
 
 STATE = ("latent", "history")  # and with forces `onnx_forces.DRAPE`
@@ -236,6 +236,7 @@ def _inputs(g: Graph, frames: str, last: str, origin: Array, model: Model) -> tu
 def predicted(g: Graph, inputs: str, model: Model, order: np.ndarray) -> tuple[str, str]:
     """Return the next code [N, C], named `next_latent`, and the distance by which it was clipped."""
     network, predictor = model.network, model.network.predictor
+    assert isinstance(predictor, PosePredictor)
     code = predictor.code
     first = np.asarray(predictor.pose)[order]
     bias = np.asarray(code.bias) + np.asarray(model.wearer.bias)

@@ -93,5 +93,5 @@ def step(
              jax.ShapeDtypeStruct(shape, jnp.float32)]  # fmt: skip
     call = jax.ffi.ffi_call(TARGET, kinds, vmap_method="sequential")
     carried, ok, garment = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose), external)
-    history, drape = restored(carried)
-    return State(*history, ok, drape), garment if vertices else None
+    (latent, rotations, positions, translation), drape = restored(carried)
+    return State(latent, rotations, positions, translation, ok, drape), garment if vertices else None

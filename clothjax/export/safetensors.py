@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +25,6 @@ from clothjax.runtime.models import (
     Wearer,
 )
 from clothjax.types import Material, Mesh, Rest
-
-Fields = TypeVar("Fields", bound=NamedTuple)
 
 FORMAT = 2  # of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
@@ -78,7 +76,7 @@ def from_safetensors(path: str | Path) -> Model:
             count = sum(key.startswith(f"{name}.") and key.endswith(".bias") for key in arrays)
             return tuple(layer(f"{name}.{i}") for i in range(count))
 
-        def fields(of: type[Fields], name: str, **others) -> Fields:
+        def fields(of: Any, name: str, **others) -> Any:
             return of(*(others[field] if field in others else arrays[f"{name}.{field}"] for field in of._fields))
 
         def bounds(name: str) -> Bounds:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -59,8 +60,8 @@ def run_stablehlo(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     external = {"external": np.zeros(3, np.float32)} if "external" in frame.arguments(model) else {}
     with tempfile.TemporaryDirectory() as folder:
         inputs, outputs = Path(folder) / "inputs.npz", Path(folder) / "outputs.npy"
-        states = {f"state_{i}": x for i, x in enumerate(state)}
-        np.savez(inputs, rotations=rotations, translation=translation, **states, **external)
+        arrays: dict[str, Any] = {f"state_{i}": x for i, x in enumerate(state)} | external
+        np.savez(inputs, rotations=rotations, translation=translation, **arrays)
         command = [sys.executable, "-c", RUN, str(Path(path).resolve()), str(inputs), str(outputs)]
         subprocess.run(command, check=True, cwd=folder)
         return np.load(outputs)

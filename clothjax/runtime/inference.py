@@ -93,6 +93,7 @@ def _advanced(
         latent = predict(network.predictor, state.latent, inputs, wearer.bias, model.config)
         latent, inside = normalisation.bounded(latent, *network.code_bounds)
     else:
+        assert hung is not None
         latent = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
         latent, inside = normalisation.bounded(latent, *network.code_bounds)
         hung, ordinary = drape.follow(model, latent, state.latent, hung, transforms, advance[0]), True
