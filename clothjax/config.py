@@ -326,7 +326,7 @@ class Stage2Config:
     hidden: tuple[int, ...] = (512, 512)
     forces: bool = False
     """Psi reads the forces on the held garment in place of the pose, and learns from `labels` in place of rollouts of
-    Phi. Fine-tuning then needs a tenth of the usual rate. The runtime and the exports do not have it yet."""
+    Phi. Fine-tuning then needs a tenth of the usual rate. A frame takes about five times as long."""
     learning_rate: float = 1e-3
     clip: float = 1.0
     sequences: int = 96
@@ -366,7 +366,8 @@ class LabelsConfig:
     noise: float = 0.35
     """Most noise on a whitened code, as its length in sqrt(J), in one frame of five."""
     external: float = 12.0
-    """Largest external acceleration in m/s^2, such as wind; about one simulation of seven draws one in a round."""
+    """Largest acceleration of wind in m/s^2. About one simulation of seven draws wind, no gravity, or another direction
+    of gravity in a round. 0: none of these."""
     steps: int = 500
     """Training steps of a round."""
     batch: int = 256

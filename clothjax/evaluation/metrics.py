@@ -47,6 +47,7 @@ def step_measures(
     frames: Sequence[int] | np.ndarray,
     config: Config,
     blendshapes: Array | None = None,
+    external: Array | None = None,
 ) -> list[StepMeasure]:
     """Measure the time steps of a trajectory that begin at the given frames, each by a solve of its own.
 
@@ -55,6 +56,7 @@ def step_measures(
         poses: windows [T + 1, 3, ...] of `motion_clips.poses`, one a frame.
         frames: from 1 to T - 1.
         blendshapes: [K, V, 3] m; their span is searched too.
+        external: [T + 1, 3] m/s^2, an acceleration beside gravity in the step to each frame.
     """
     state = problem(scene, config)
     search = None if blendshapes is None else _search_span(scene, character, blendshapes, config)
@@ -68,7 +70,8 @@ def step_measures(
     measures = []
     for frame in frames:
         around = jax.tree.map(lambda x, t=frame: x[t], poses)
-        step, skinned, persistent, advance = state(character, trajectory[frame - 1], trajectory[frame], around)
+        pushed = None if external is None else external[frame + 1]
+        step, skinned, persistent, advance = state(character, trajectory[frame - 1], trajectory[frame], around, pushed)
         new = trajectory[frame + 1] + advance[None]
         # two starts, the better end: folds have many minima
         ends = [

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from functools import cache
 from itertools import count
 from pathlib import Path
 
@@ -24,8 +23,8 @@ from clothjax.evaluation.rollouts import (
 from clothjax.files import storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
-from clothjax.networks.normalisation import ForceScales
 from clothjax.networks.psi import input_joints
+from clothjax.physics.energies import GRAVITY
 from clothjax.progress import progress_bar
 from clothjax.runtime import models, trained
 from clothjax.simulation import assembly, reference
@@ -34,6 +33,12 @@ from clothjax.simulation.characters import Character
 from clothjax.types import Motion
 
 CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, and where the solver is asked
+PUSHES = {  # accelerations beside gravity, m/s^2, and the frames in which they push
+    "none": ((0.0, 0.0, 0.0), (0, None)),
+    "no gravity": ((0.0, GRAVITY, 0.0), (0, None)),
+    "sideways": ((GRAVITY, GRAVITY, 0.0), (0, None)),
+    "gust": ((12.0, 0.0, 0.0), (30, 45)),
+}
 
 
 def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
@@ -85,7 +90,7 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     if not names:
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
     shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-    by_motion, by_character, steps = {}, {}, count(1)
+    by_motion, by_character, by_push, steps = {}, {}, {}, count(1)
     with progress_bar("evaluating", 2 * len(names) + 1) as report:
         for name in names:
             clip = assembly.evaluation_motion(experiment, name)
@@ -98,6 +103,8 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
         long = _long(experiment, stages, character, first)
         if config.evaluation.wearers:
             by_character = _characters(experiment, stages, first)
+        if config.stage2.forces:
+            by_push = _pushed(experiment, run, character, first)
         report(next(steps))
     return {
         "evaluation": {
@@ -105,6 +112,7 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
         },
         "motions": by_motion,
         "wearers": by_character,
+        "pushed": by_push,
         "betas": betas.tolist(),
         "gap_frames": config.evaluation.gap_frames,
         "garment": config.garment,
@@ -132,18 +140,7 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         compiled = play.lower(model, character, poses).compile()
         return lambda: np.asarray(compiled(model, character, poses))
 
-    @cache
-    def with_forces() -> Callable:
-        student = trained.psi(run)
-        assert isinstance(student.normalizers, ForceScales)
-        make = animators.force_psi_animator(student.garment, student.normalizers)
-        params = {"params": student.predictor}
-        play = jax.jit(lambda c, p: rollouts.states(make, params, experiment, c, p))
-        return lambda character, poses: np.asarray(play(character, poses))
-
     def psi(character: Character, clip: Motion):
-        if config.stage2.forces:
-            return lambda: with_forces()(character, windows(clip))
         loaded = models.load(run, betas=np.asarray(character.betas), material=character.material)
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)
@@ -225,6 +222,26 @@ def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) 
             for stage, make in stages.items()
             if stage != "lbs"
         }
+    return result
+
+
+def _pushed(experiment: Experiment, run: Path, character: Character, clip: Motion) -> dict[str, dict]:
+    """Measure the gaps of a Psi with forces under accelerations beside gravity, over the start of a clip."""
+    config, frames = experiment.config, CHARACTERS_FRAMES
+    clip = Motion(clip.rotations[:frames], clip.translation[:frames], clip.fps)
+    poses = windows(clip)
+    count = poses.translation.shape[0]
+    sampled = np.linspace(SETTLING_FRAMES, count - 2, 2 * CHARACTERS_GAPS).astype(int)
+    psi = models.load(run, betas=np.asarray(character.betas), material=character.material)
+    result = {}
+    for name, (acceleration, lasting) in PUSHES.items():
+        external = np.zeros((count, 3), np.float32)
+        external[slice(*lasting)] = acceleration
+        track = psi_trajectory(psi, clip, jnp.asarray(external))
+        steps = metrics.step_measures(
+            experiment.scene, character, jnp.asarray(track), poses, sampled, config, external=external
+        )
+        result[name] = metrics.gaps(steps)
     return result
 
 

@@ -90,12 +90,15 @@ def phi_trajectory(experiment: Experiment, phi: dict, character: Character, pose
     return np.asarray(play(phi, poses))
 
 
-def psi_trajectory(psi: Model, clip: Motion) -> np.ndarray:
+def psi_trajectory(psi: Model, clip: Motion, external: Array | None = None) -> np.ndarray:
     """Roll Psi out on a clip of T frames: return the garment [T - 2, V, 3] m at the same frames as `windows` has.
 
     It is relative to the root, as the other trajectories are.
+
+    Args:
+        external: [T - 2, 3] m/s^2, as of `inference.animate`.
     """
-    return relative(lambda motion: inference.animate(psi, motion)[0], clip)
+    return relative(lambda motion: inference.animate(psi, motion, external)[0], clip)
 
 
 def relative(animate: Callable[[Motion], Array], clip: Motion) -> np.ndarray:

@@ -156,13 +156,16 @@ def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
     return jax.vmap(one)(model.wearer, states, poses)
 
 
-def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
+def animate(model: Model, motion: Motion, external: Array | None = None) -> tuple[Array, Array]:
     """Animate a whole motion: vertices [T, V, 3] m in the world, and `State.ok` [T] of each frame.
 
     The first frame is the garment settled on the standing first pose.
 
+    Args:
+        external: [T, 3] m/s^2, as of `step` for each frame.
+
     Raises:
-        ValueError: if the number of joints or frames a second of the motion is not the model's.
+        ValueError: if the number of joints or frames a second of the motion is not the model's; as `step`.
     """
     if motion.rotations.shape[1] != len(model.names):
         raise ValueError(f"the motion has {motion.rotations.shape[1]} joints, the garment's body {len(model.names)}")
@@ -171,21 +174,28 @@ def animate(model: Model, motion: Motion) -> tuple[Array, Array]:
             f"the motion has {motion.fps:g} frames a second, the garment was trained for {model.config.fps:g}: "
             "resample the motion"
         )
-    return _animate(model, motion)
+    return _animate(model, motion, external)
 
 
 @jax.jit
-def _animate(model: Model, motion: Motion) -> tuple[Array, Array]:
-    return rollout(model, motion, lambda state, vertices: (vertices, state.ok))
+def _animate(model: Model, motion: Motion, external: Array | None) -> tuple[Array, Array]:
+    return rollout(model, motion, lambda state, vertices: (vertices, state.ok), external=external)
 
 
-def rollout(model: Model, motion: Motion, kept: Callable[[State, Any], T], vertices: bool = True) -> T:
+def rollout(
+    model: Model,
+    motion: Motion,
+    kept: Callable[[State, Any], T],
+    vertices: bool = True,
+    external: Array | None = None,
+) -> T:
     """Take a step for every frame of a motion, and return what `kept` keeps of each, stacked; for use within jit."""
     poses = Pose(jnp.asarray(motion.rotations, jnp.float32), jnp.asarray(motion.translation, jnp.float32))
     first = jax.tree.map(lambda x: x[0], poses)
 
-    def frame(state, pose):
-        state, shown = step(model, state, pose, vertices)
+    def frame(state, inputs):
+        pose, pushed = inputs
+        state, shown = step(model, state, pose, vertices, pushed)
         return state, kept(state, shown)
 
-    return jax.lax.scan(frame, initial_state(model, first), poses)[1]
+    return jax.lax.scan(frame, initial_state(model, first), (poses, external))[1]

@@ -27,19 +27,19 @@ class Problem(NamedTuple):
     advance: Array  # [3] m, of the root
 
 
-def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, Pose], Problem]:
+def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, Pose, Array | None], Problem]:
     """Return a jitted function from a garment's last two frames to the `Problem` that the solver then solves.
 
-    Its arguments are the character, the garment [V, 3] m at the previous and at the current frame, and the window of
-    poses (leading axis 3). Each garment is relative to the root of its own frame.
+    Its arguments are the character, the garment [V, 3] m at the previous and at the current frame, the window of poses
+    (leading axis 3), and an external acceleration [3] m/s^2 or None. Each garment is relative to the root of its frame.
     """
 
     @jax.jit
-    def state(character: Character, before: Array, now: Array, poses: Pose) -> Problem:
+    def state(character: Character, before: Array, now: Array, poses: Pose, external: Array | None = None) -> Problem:
         window = characters.window(scene, character, poses)
         velocity = now - (before + poses.translation[0][None])
         cloth = ClothState(now, velocity, jnp.zeros_like(now), *[jnp.zeros(0, now.dtype)] * 2)
-        step = time_step.time_step(scene, character, cloth, window, 1.0 / config.fps, config)
+        step = time_step.time_step(scene, character, cloth, window, 1.0 / config.fps, config, external)
         hold = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
         lbs = characters.skinned(character, window.following)
         hold = jnp.where(scene.garment.pinned[:, None], lbs, hold)
@@ -55,6 +55,7 @@ def simulate(
     config: Config,
     *,
     start: tuple[Array, Array] | None = None,
+    external: Array | None = None,
     max_iterations: int = 500,
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[np.ndarray, list[SolverInfo]]:
@@ -66,6 +67,7 @@ def simulate(
         poses: windows [T, 3, ...] of `motion_clips.poses`, one a frame.
         start: the garment [V, 3] m at the frame before the first and at the first, each relative to its root. By
             default it starts like Phi: skinned, then one long quasi-static step, whose info comes first.
+        external: [T + 1, 3] m/s^2, an acceleration beside gravity in the step to each frame; the first is not used.
         max_iterations: most Newton iterations in a frame.
         progress: called with the number of finished frames.
 
@@ -90,7 +92,8 @@ def simulate(
         before, now = (np.asarray(x, np.float32) for x in start)
     trajectory = [now]
     for frame in range(poses.translation.shape[0]):
-        step, _, hold, advance = state(character, before, now, _at(poses, frame))
+        pushed = None if external is None else external[frame + 1]
+        step, _, hold, advance = state(character, before, now, _at(poses, frame), pushed)
         before, now = now, solve(hold, step) - np.asarray(advance)[None]
         trajectory.append(now)
         progress(len(trajectory))

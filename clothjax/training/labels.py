@@ -152,13 +152,20 @@ def make_segment(scene: Scene, config: Config) -> Callable:
 
 
 def draw_external(key: Array, most: float) -> Array:
-    """Draw an external acceleration [3] m/s^2: mostly none, else no weight, or in any direction; at most `most`."""
+    """Draw an external acceleration [3] m/s^2: mostly none, else no weight, gravity in any direction, or wind.
+
+    Args:
+        most: m/s^2, of wind; 0 for none of all.
+    """
     kind_key, direction_key, length_key = jax.random.split(key, 3)
     direction = jax.random.normal(direction_key, (3,))
-    wind = most * jax.random.uniform(length_key) * direction / jnp.linalg.norm(direction)
-    kind = jax.random.uniform(kind_key)
+    direction = direction / jnp.linalg.norm(direction)
     weightless = jnp.array([0.0, min(most, GRAVITY), 0.0])
-    return jnp.where(kind < PUSHED, jnp.where(kind < 0.2 * PUSHED, weightless, wind), 0.0)
+    turned = weightless + min(most, GRAVITY) * direction
+    wind = most * jax.random.uniform(length_key) * direction
+    kind = jax.random.uniform(kind_key) / PUSHED
+    pushed = jnp.where(kind < 0.2, weightless, jnp.where(kind < 0.5, turned, wind))
+    return jnp.where(kind < 1.0, pushed, 0.0)
 
 
 def usable(labels: Labels) -> Array:

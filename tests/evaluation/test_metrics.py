@@ -12,6 +12,7 @@ from clothjax.config import LossConfig, Ramp
 from clothjax.evaluation import metrics, rollouts
 from clothjax.evaluation.metrics import StepMeasure
 from clothjax.networks import animators
+from clothjax.physics.energies import GRAVITY
 from clothjax.simulation import assembly, characters, reference, rollout
 from clothjax.training import loss, stage1
 
@@ -54,6 +55,34 @@ def test_skinning_has_an_energy_gap_of_one_and_the_solver_none(walking):
     assert len(solved) == 9 and all(info.converged for info in infos)
     gaps = metrics.gaps(metrics.step_measures(experiment.scene, character, solved, short, [5], experiment.config))
     assert abs(gaps["energy_gap"]) < 1e-3 and gaps["hold_gap"] < 0.05 and gaps["step_error_mm"] < 1.0
+
+
+def test_an_acceleration_against_gravity_is_no_gravity(walking):
+    """For the solver, and for the measure of its own steps; in frames where it pushes, and only there."""
+    experiment, character, poses = walking
+    scene, config, short = experiment.scene, experiment.config, jax.tree.map(lambda x: x[:4], poses)
+    physics = dataclasses.replace(config.physics, without=("gravity",))
+    start = rollouts.skinned_trajectory(experiment, character, jax.tree.map(lambda x: x[:2], poses))
+    up = np.tile(np.float32([0, GRAVITY, 0]), (5, 1))
+    tracks = {
+        "none": reference.simulate(scene, character, short, config, start=start)[0],
+        "pushed": reference.simulate(scene, character, short, config, start=start, external=up)[0],
+        "light": reference.simulate(scene, character, short, dataclasses.replace(config, physics=physics), start=start)[
+            0
+        ],
+        "late": reference.simulate(
+            scene, character, short, config, start=start, external=up * [[0], [0], [0], [0], [1]]
+        )[0],
+    }
+    np.testing.assert_allclose(tracks["pushed"], tracks["light"], atol=2e-4)
+    assert np.abs(tracks["pushed"] - tracks["none"]).max() > 2e-3
+    np.testing.assert_array_equal(tracks["late"][:4], tracks["none"][:4])
+    assert np.abs(tracks["late"][4] - tracks["none"][4]).max() > 1e-3
+    right, wrong = (
+        metrics.gaps(metrics.step_measures(scene, character, tracks["late"], short, [3], config, external=pushed))
+        for pushed in (up * [[0], [0], [0], [0], [1]], None)
+    )
+    assert right["hold_gap"] < 0.05 < wrong["hold_gap"]
 
 
 def test_penetration_is_how_deep_inside():

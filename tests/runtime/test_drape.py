@@ -82,6 +82,13 @@ def test_an_acceleration_against_gravity_is_no_gravity(forced, motion):
     assert np.abs(falls - free).max() > 1e-5
 
 
+def test_a_motion_is_animated_with_an_acceleration_for_each_frame(model, motion):
+    external = jnp.zeros((FRAMES, 3)).at[4].set(jnp.array([30.0, 0.0, 0.0]))
+    calm, pushed = (inference.animate(model, motion, x)[0] for x in (None, external))
+    np.testing.assert_allclose(pushed[:4], calm[:4], atol=1e-6)
+    assert np.abs(pushed[4] - calm[4]).max() > 1e-4
+
+
 def test_a_psi_without_forces_refuses_an_acceleration(motion):
     model = random_model(skip=True)
     state = inference.initial_state(model, pose(motion, 0))

@@ -211,11 +211,15 @@ def test_a_simulation_that_is_pushed_feels_it(toy, monkeypatch):
     assert np.abs(expected - momentum(None)).max() > 0.1 * np.abs(expected).max()
 
 
-def test_external_accelerations_are_mostly_none_and_never_beyond_the_most():
+def test_external_accelerations_are_mostly_none_else_no_weight_another_gravity_or_wind():
     drawn = np.asarray(jax.vmap(labels.draw_external, (0, None))(sampling.keys(0, 2000), 12.0))
     length = np.linalg.norm(drawn, axis=1)
-    assert 0.8 < (length == 0).mean() < 0.9 and length.max() <= 12.0
+    assert 0.8 < (length == 0).mean() < 0.9 and length.max() <= 2 * GRAVITY + 1e-4
     assert (np.abs(drawn - [0, GRAVITY, 0]).max(axis=1) < 1e-5).sum() > 20
+    weight = np.linalg.norm(drawn - [0, GRAVITY, 0], axis=1)  # of gravity and acceleration together
+    turned = (np.abs(weight - GRAVITY) < 1e-4) & (length > 0)
+    assert turned.sum() > 40 and (drawn[turned, 1] > GRAVITY).any() and (drawn[turned, 1] < GRAVITY).any()
+    assert (np.asarray(jax.vmap(labels.draw_external, (0, None))(sampling.keys(0, 200), 0.0)) == 0).all()
 
 
 def test_a_round_survives_a_file(finished, tmp_path):
