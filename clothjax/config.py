@@ -439,3 +439,7 @@ class Config:
             not self.stage2.forces or self.model.latent_update == "descent",
             "stage2.forces needs the inverse Hessian of model.latent_update: descent",
         )
+        _require(
+            not self.stage2.forces or (self.physics.body == "moving" and not self.peer.network),
+            "stage2.forces needs a body that moves (physics.body: moving), and is not of a baseline (peer.network)",
+        )

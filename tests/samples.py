@@ -352,8 +352,8 @@ class ForcePsi(NamedTuple):
         )
 
 
-def random_force_psi(skip=True, **physics):
-    """A random Psi with forces whose code decays, with either a skip or a ReLU on the weights."""
+def random_force_psi(skip=True, limit=5.0, **physics):
+    """A random Psi with forces whose code decays, within +-`limit`, with either a skip or a ReLU on the weights."""
     config = small()
     config = dataclasses.replace(
         config,
@@ -384,7 +384,7 @@ def random_force_psi(skip=True, **physics):
     predictor["mlp"]["dense_2"] |= {"kernel": 300 * predictor["mlp"]["dense_2"]["kernel"]}
     scales = ForceScales(
         *(jnp.asarray(x, jnp.float32) for x in (0.1 * rng.normal(size=count), spread, output)),
-        whitening, *(jnp.full(size, x, jnp.float32) for x in (-5.0, 5.0)), candidates,
+        whitening, *(jnp.full(size, x, jnp.float32) for x in (-limit, limit)), candidates,
     )  # fmt: skip
     return ForcePsi(experiment, garment, predictor, scales)
 

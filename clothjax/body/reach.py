@@ -1,4 +1,4 @@
-"""The part of a body that a garment can touch. NumPy only."""
+"""The part of a body that a garment can touch, on the host."""
 
 import numpy as np
 from scipy.spatial import KDTree

@@ -231,12 +231,13 @@ def _pushed(experiment: Experiment, run: Path, character: Character, clip: Motio
     clip = Motion(clip.rotations[:frames], clip.translation[:frames], clip.fps)
     poses = windows(clip)
     count = poses.translation.shape[0]
-    sampled = np.linspace(SETTLING_FRAMES, count - 2, 2 * CHARACTERS_GAPS).astype(int)
     psi = models.load(run, betas=np.asarray(character.betas), material=character.material)
     result = {}
     for name, (acceleration, lasting) in PUSHES.items():
         external = np.zeros((count, 3), np.float32)
         external[slice(*lasting)] = acceleration
+        first, last = max(lasting[0] - 1, SETTLING_FRAMES), (lasting[1] or count) - 2  # steps that are pushed
+        sampled = np.linspace(first, last, 2 * CHARACTERS_GAPS).astype(int)
         track = psi_trajectory(psi, clip, jnp.asarray(external))
         steps = metrics.step_measures(
             experiment.scene, character, jnp.asarray(track), poses, sampled, config, external=external

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.runtime import inference
-from clothjax.runtime.models import Drape, Model, PosePredictor, State
+from clothjax.runtime.models import CAUSES, Drape, Model, PosePredictor, State
 from clothjax.types import Array, Pose
 
 HISTORY = ("latent", "rotations", "positions", "translations")  # of a state, and ...
@@ -47,7 +47,7 @@ def function(model: Model) -> Callable:
         drape = Drape(*given[4:8]) if _with_forces(model) else None
         rotations, translation, *external = given[4 if drape is None else 8 :]
         latent, before, places, translations = given[:4]
-        state = State(latent, before, places, translations, jnp.asarray(True), drape)
+        state = State(latent, before, places, translations, jnp.zeros(len(CAUSES), bool), drape)
         following, vertices = inference.step(model, state, Pose(rotations, translation), True, *external)
         return *following[:4], *(following.drape or ()), following.ok, vertices
 
@@ -77,8 +77,9 @@ def describe(model: Model) -> dict:
             "and translations, entry 0 is the newest frame",
             "external": "an acceleration of the cloth beside gravity, m/s^2; zeros for none",
             "first_state": "all zeros but previous_rotations and previous_translations, both entries of which are the "
-            f"first pose. Run {inference.SETTLING} times with the first pose, feeding the state back: the garment has "
-            "settled",
+            "first pose. Run once with that pose; its next_garment and next_position are previous_garment and "
+            f"previous_position, all else stays. Run {inference.SETTLING} times, feeding the state back: the garment "
+            "has settled",
         }
     return about | {
         "state": "feed the first four results back; of previous_*, entry 0 is the newest frame",

@@ -15,7 +15,7 @@ import numpy as np
 
 from clothjax.export import frame, sidecar
 from clothjax.runtime import inference
-from clothjax.runtime.models import Model, PosePredictor
+from clothjax.runtime.models import ForcePredictor, Model, PosePredictor
 from clothjax.types import Array, Motion, Pose
 
 
@@ -30,8 +30,11 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
         about: more entries for the JSON.
 
     Raises:
+        ValueError: for a model with forces in eight bits, which are too few for the whitening.
         ImportError: if TensorFlow is not installed.
     """
+    if int8 and isinstance(model.network.predictor, ForcePredictor):
+        raise ValueError("LiteRT has no model with forces in eight bits; leave --int8 out, or take ONNX or plain C")
     try:
         import tensorflow  # pyright: ignore[reportMissingModuleSource]  # not in the environment: too large
         from jax.experimental import jax2tf

@@ -8,7 +8,7 @@ Inputs that differ in scale are first multiplied by gains.
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,13 +19,14 @@ from clothjax.networks import psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
 from clothjax.physics.energies import GRAVITY, THICKNESS
-from clothjax.runtime.models import Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor, Shown
+from clothjax.runtime.models import CAUSES, Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor, Shown
 from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; one with forces has 2
 ALIGN = 64
+MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
 FLAGS = ("-O3", "-march=native")
 
@@ -35,6 +36,9 @@ def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
 
     Args:
         about: more entries for the JSON.
+
+    Raises:
+        ValueError: for what plain C does not have with forces: pose blend shapes of a body, and very many vertices.
     """
     path = Path(path)
     path.write_bytes(packed(model))
@@ -46,7 +50,12 @@ def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
 
 def packed(model: Model) -> bytes:
     """Return a model as the bytes of a `.psi` file."""
-    parts = (array.astype(array.dtype.newbyteorder("<")).tobytes() for array in _arrays(model))
+    return as_bytes(_arrays(model))
+
+
+def as_bytes(arrays: Iterable[np.ndarray]) -> bytes:
+    """Return arrays as the bytes of a `.psi` file."""
+    parts = (array.astype(array.dtype.newbyteorder("<")).tobytes() for array in arrays)
     return b"".join(part + bytes(-len(part) % ALIGN) for part in parts)
 
 
@@ -93,6 +102,8 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     assert cloth is not None
     if predictor.corrections is not None:
         raise ValueError("plain C has no pose blend shapes of a body yet; export to another format")
+    if 3 * len(cloth.mass) > MOST_WIDTH:
+        raise ValueError(f"plain C takes {MOST_WIDTH // 3} vertices of a garment with forces, not {len(cloth.mass)}")
     felt = predictor.felt or Shown(network.shapes, network.weights)
     mesh, rest, scales = predictor.mesh, cloth.rest, predictor.scales
     vertices, neighbours = scales.candidates.shape
@@ -280,11 +291,20 @@ class Psi:
         arguments = (self._model, self._state, *map(_pointer, pose), vertices_out)
         return lambda: self._c.psi_step(*arguments)
 
+    def outside(self) -> tuple[str, ...]:
+        """Return which of `models.CAUSES` brought the last frame out of the range of training."""
+        bits = self._c.psi_outside(self._state)
+        return tuple(cause for i, cause in enumerate(CAUSES) if bits >> i & 1)
+
     def state(self) -> np.ndarray:
         """Return what goes on from frame to frame, as `psi_keep` orders it."""
         carried = np.zeros(self._c.psi_carried(self._model), np.float32)
         self._c.psi_keep(self._model, self._state, _pointer(carried))
         return carried
+
+    def put_back(self, carried: Array) -> None:
+        """Go on from what `state` returned."""
+        self._c.psi_put_back(self._model, self._state, _pointer(np.ascontiguousarray(carried, np.float32)))
 
     def push(self, external: Array) -> bool:
         """Set the external acceleration [3] m/s^2 of the frames to come; return whether the model feels it."""

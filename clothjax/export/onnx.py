@@ -45,6 +45,7 @@ def to_onnx(
         about: more entries for the JSON.
 
     Raises:
+        ValueError: for a model with forces whose body has pose blend shapes.
         ImportError: if the extra `export` is not installed.
     """
     path = Path(path)
@@ -111,8 +112,11 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         advance = g("Transpose", stepped, perm=[0, 2, 1])
         rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
         code = onnx_forces.next_code(g, model, rows, transforms, advance)
-        limits = network.code_bounds
-        latent, strayed = g.within(code, limits.low, limits.high, name="next_latent")
+        low, high = (np.asarray(x) for x in network.code_bounds[:2])
+        whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)
+        latent, _ = g.within(whole, low, high, name="next_latent")
+        strayed = g("Abs", g("Sub", latent, code))  # NaN is not within the slack
+        sound = g("And", sound, g("Unsqueeze", onnx_forces.pushed(g), np.array([1], np.int64)))
     else:
         inputs, order = _inputs(g, frames, last, joints[model.input_joints[0]], model)
         inputs = g("Sub", inputs, np.asarray(predictor.pose_mean)[order])

@@ -102,11 +102,17 @@ def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance
     return placed
 
 
+def pushed(g: Graph) -> str:
+    """Return whether `external` is finite, [N, 1] bool."""
+    return g.all(g("Less", g("Abs", "external"), np.float32(np.finfo(np.float32).max)), axis=1)
+
+
 def _momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
     timestep = 1.0 / model.config.fps
     weight = 0.0 if "gravity" in model.config.physics.without else GRAVITY
-    pushed = g("Mul", g.reshape("external", 1, 3), np.float32(timestep**2))
-    flown = g("Add", g("Add", "position", "velocity"), pushed)
+    external = g("Where", pushed(g), "external", np.zeros((1, 3)))
+    further = g("Mul", g.reshape(external, 1, 3), np.float32(timestep**2))
+    flown = g("Add", g("Add", "position", "velocity"), further)
     apart = g("Sub", g("Transpose", flown, perm=[0, 2, 1]), held)
     down = np.array([[0.0], [-weight], [0.0]])
     return g("Mul", g("Add", g("Mul", apart, np.float32(1.0 / timestep**2)), down), np.asarray(it.cloth.mass))
@@ -169,7 +175,8 @@ def _bending(g: Graph, it: Parts, held: str, hinges: np.ndarray) -> list[str]:
     sine, cosine = _dot(g, _cross(g, *normals), edge), g("Mul", _dot(g, *normals), length)
     # twice the arc of half the angle: there is no arctan2
     radius = g("Sqrt", g("Add", g("Mul", sine, sine), g("Mul", cosine, cosine)))
-    half = g("Div", sine, g("Max", g("Add", radius, cosine), np.float32(1e-30)))
+    sine = g("Where", g("Equal", sine, np.float32(0.0)), np.float32(1e-30), sine)  # folded over: half a turn
+    half = g("Div", sine, g("Max", g("Add", radius, cosine), np.float32(1e-37)))
     angle = g("Sub", g("Mul", g("Atan", half), np.float32(2.0)), np.asarray(rest.hinge_angle))
     stiff = float(it.cloth.material.bending) / (4.0 * np.asarray(rest.hinge_area))
     weight = g("Mul", g("Cast", bent, to=g.onnx.TensorProto.FLOAT), stiff)

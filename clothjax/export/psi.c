@@ -40,7 +40,7 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     float timestep, gravity, stiffness, offset;
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
-    const float *inverse, *shear, *trace;             /* [4][triangles], [triangles], [triangles] */
+    const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
     const float *bend, *angle;                        /* [hinges] */
     const int32_t *face, *candidate;                  /* [3][faces], [candidates][vertices] */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
@@ -67,6 +67,7 @@ struct psi_model {
 
 struct psi_state {
     void *memory;
+    int outside; /* of the last frame, psi_outside() */
     float *latent, *next;
     float *rotations, *positions, *translation;  /* [3][joints][9], [3][joints][3], [3][3], newest first */
     float *global, *skinning;                    /* rotations [joints][9]; matrices [moving][12] */
@@ -74,6 +75,7 @@ struct psi_state {
     int16_t *fixed; /* inputs of layers in fixed point */
     /* with forces, rows [vertices, to a multiple of LANES] */
     float external[3];
+    int pushed; /* whether the external acceleration was finite */
     float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
     float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
@@ -150,10 +152,10 @@ static int takes_exact(const exact *e, int32_t inputs, int32_t outputs) {
 static int fits_forces(const psi_model *m) {
     const forces *f = &m->f;
     const int32_t code = m->code, last = m->decode[m->decoder - 1].outputs;
-    int good = takes(&f->read_fine, code, m->read.outputs);
+    int good = takes(&f->read_fine, code, m->read.outputs) && m->read.outputs > 0 && m->shapes.inputs > 0 && last > 0;
     good &= takes(&f->unshape, 3 * f->vertices, m->shapes.inputs) && (!m->mixed || takes(&f->unmix, m->mix.outputs, last));
     for (int32_t i = 0; i < m->decoder; i++)
-        good &= takes(&f->undecode[i], m->decode[i].outputs, m->decode[i].inputs);
+        good &= m->decode[i].outputs > 0 && takes(&f->undecode[i], m->decode[i].outputs, m->decode[i].inputs);
     good &= takes_exact(&f->unread, m->read.outputs, code) && takes_exact(&f->change, code, code) &&
             takes_exact(&f->move, code, code);
     int32_t width = f->first.outputs - code;
@@ -217,8 +219,8 @@ static void read_forces(reader *r, psi_model *m) {
     f->mass = floats(r, padded(f->vertices));
     f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
     f->inverse = floats(r, 4 * (size_t)padded(f->triangles));
-    f->shear = floats(r, padded(f->triangles));
-    f->trace = floats(r, padded(f->triangles));
+    f->mu = floats(r, padded(f->triangles));
+    f->lam = floats(r, padded(f->triangles));
     f->hinge = indices(r, 4 * padded(f->hinges), f->vertices);
     f->bend = floats(r, padded(f->hinges));
     f->angle = floats(r, padded(f->hinges));
@@ -545,7 +547,7 @@ static void dense_kinds(const layer *l, float *const *x, float *const *y, psi_st
     for (int k = 0; k < KINDS; k++) {
         const float limit = largest(x[k], l->gain, l->inputs);
         const int some = limit > LEAST && limit <= FLT_MAX;
-        step[k] = some ? limit / most : 0.0f;
+        step[k] = some ? limit / most : limit <= LEAST ? 0.0f : NAN;
         q[k] = s->fixed + (size_t)k * stride;
         if (some) {
             quantise(l, x[k], most / limit, s->fixed + (size_t)k * stride);
@@ -718,8 +720,8 @@ static void push_stretching(const forces *f, const float *held, float *force) {
             const float s0 = 0.5f * (along[0] * along[0] + along[1] * along[1] + along[2] * along[2] - 1.0f),
                         s1 = 0.5f * (along[0] * across[0] + along[1] * across[1] + along[2] * across[2]),
                         s2 = 0.5f * (across[0] * across[0] + across[1] * across[1] + across[2] * across[2] - 1.0f),
-                        trace = f->trace[t + i] * (s0 + s2), k0 = f->shear[t + i] * s0 + trace,
-                        k1 = f->shear[t + i] * s1, k2 = f->shear[t + i] * s2 + trace;
+                        trace = f->lam[t + i] * (s0 + s2), k0 = f->mu[t + i] * s0 + trace,
+                        k1 = f->mu[t + i] * s1, k2 = f->mu[t + i] * s2 + trace;
             for (int k = 0; k < 3; k++) {
                 left[k] = k0 * along[k] + k1 * across[k];
                 right[k] = k1 * along[k] + k2 * across[k];
@@ -848,7 +850,7 @@ static void pull_back(const psi_model *m, psi_state *s) {
 static void soften(float *restrict x, const float *restrict middle, const float *restrict inverse, int32_t count) {
     for (int32_t i = 0; i < count; i++) {
         float y = (x[i] - middle[i]) * inverse[i];
-        y = y > 9.0f ? 9.0f : y < -9.0f ? -9.0f : y;
+        y = y > -9.0f ? (y < 9.0f ? y : 9.0f) : -9.0f;
         const float p = y * 2.88539008f, whole = (float)(int32_t)(p + (p < 0.0f ? -0.5f : 0.5f)),
                     t = (p - whole) * 0.693147181f;
         float e = 1.0f + t * (1.0f + t * (0.5f + t * (0.166666667f + t * (0.0416666667f + t * (0.00833333333f +
@@ -880,6 +882,8 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     memcpy(x, s->latent, code * sizeof(float));
     dense_exact(&f->change, s->change, x + code, y, s);
     for (int k = 0; k < KINDS; k++) memcpy(x + (2 + k) * code, s->pulled[k], code * sizeof(float));
+    float sum = 0.0f; /* NaN if one of them is */
+    for (int32_t i = 0; i < (2 + KINDS) * code; i++) sum += 0.0f * x[i];
     soften(x, f->middle, f->inverse_spread, (2 + KINDS) * code);
     dense(&f->first, x, y, s);
     const int32_t width = f->first.outputs - code;
@@ -892,7 +896,7 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     }
     for (int32_t i = 0; i < code; i++) s->next[i] += y[i];
     dense_exact(&f->move, s->next, z, y, s);
-    for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + z[i];
+    for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + z[i] + sum;
 }
 
 /* How the garment hangs after a step; the code before it is in s->next. */
@@ -959,7 +963,9 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     } else if (vertices) {
         skin(m, s, decode(m, s, &m->shapes), vertices);
     }
-    return finite && ordinary && inside && m->known;
+    s->outside = (finite && s->pushed ? 0 : PSI_NOT_FINITE) | (ordinary ? 0 : PSI_POSE) | (m->known ? 0 : PSI_WEARER) |
+                 (inside ? 0 : PSI_CODE);
+    return s->outside == 0;
 }
 
 /* Gives a state its rows in `room`, or, where that is NULL, only counts the floats that they need. */
@@ -1006,6 +1012,7 @@ psi_state *psi_blank(const psi_model *m) {
         return NULL;
     }
     arrange(m, s, (float *)aligned(s->memory));
+    s->pushed = 1;
     return s;
 }
 
@@ -1034,8 +1041,12 @@ void psi_end(psi_state *s) {
     free(s);
 }
 
+int psi_outside(const psi_state *s) { return s->outside; }
+
 int psi_push(const psi_model *m, psi_state *s, const float *external) {
-    memcpy(s->external, external, sizeof s->external);
+    s->pushed = 1;
+    for (int c = 0; c < 3; c++) s->pushed &= fabsf(external[c]) <= FLT_MAX;
+    for (int c = 0; c < 3; c++) s->external[c] = s->pushed ? external[c] : 0.0f;
     return m->forced != 0;
 }
 

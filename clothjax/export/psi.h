@@ -37,14 +37,18 @@ psi_state *psi_begin(const psi_model *model, const float *rotations, const float
 psi_state *psi_blank(const psi_model *model);
 void psi_end(psi_state *state);
 
-/* An acceleration of the cloth beside gravity, external [3] m/s^2, such as wind, in all frames to come. Whether the
- * model feels it: only one with forces does. */
+/* An acceleration of the cloth beside gravity, external [3] m/s^2, such as wind, in all frames to come; one that is not
+ * finite does not push. Whether the model feels it: only one with forces does. */
 int psi_push(const psi_model *model, psi_state *state, const float *external);
 
 /* The next frame: vertices [vertices][3] in the world, or NULL for a garment that nobody sees. It takes no memory.
  * 0 where the pose, the wearer or the code was out of the range of training and was brought into it. */
 int psi_step(const psi_model *model, psi_state *state, const float *rotations, const float *translation,
              float *vertices);
+
+/* What of the last frame was out of the range of training: the sum of these, 0 for nothing. */
+enum { PSI_NOT_FINITE = 1, PSI_POSE = 2, PSI_WEARER = 4, PSI_CODE = 8 };
+int psi_outside(const psi_state *state);
 
 /* What of a state goes on from frame to frame, psi_carried() floats, to be kept and put back: the code, then of the last
  * two poses, newest first, the rotations, the joints' positions [2][joints][3] and the translations. With forces, then

@@ -7,7 +7,7 @@ namespace ffi = xla::ffi;
 static ffi::Error Step(ffi::Buffer<ffi::U8> file, ffi::Buffer<ffi::F32> carried, ffi::Buffer<ffi::F32> rotations,
                        ffi::Buffer<ffi::F32> translation, ffi::Buffer<ffi::F32> external,
                        ffi::ResultBuffer<ffi::F32> next,
-                       ffi::ResultBuffer<ffi::PRED> ok, ffi::ResultBuffer<ffi::F32> vertices) {
+                       ffi::ResultBuffer<ffi::PRED> outside, ffi::ResultBuffer<ffi::F32> vertices) {
   const char *error = nullptr;
   psi_model *model = psi_open(file.typed_data(), file.element_count(), &error);
   if (!model) return ffi::Error::InvalidArgument(error);
@@ -20,8 +20,8 @@ static ffi::Error Step(ffi::Buffer<ffi::U8> file, ffi::Buffer<ffi::F32> carried,
   if (state) {
     psi_put_back(model, state, carried.typed_data());
     psi_push(model, state, external.typed_data());
-    *ok->typed_data() = psi_step(model, state, rotations.typed_data(), translation.typed_data(),
-                                 seen ? vertices->typed_data() : nullptr);
+    psi_step(model, state, rotations.typed_data(), translation.typed_data(), seen ? vertices->typed_data() : nullptr);
+    for (int i = 0; i < 4; i++) outside->typed_data()[i] = psi_outside(state) >> i & 1;
     psi_keep(model, state, next->typed_data());
   }
   psi_end(state);

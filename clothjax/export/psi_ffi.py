@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from clothjax.export import native
 from clothjax.runtime import inference
-from clothjax.runtime.models import Model, State
+from clothjax.runtime.models import CAUSES, Model, State
 from clothjax.types import Array, Pose
 
 SOURCE = Path(__file__).with_name("psi_ffi.cc")
@@ -89,9 +89,9 @@ def step(
     carried, restored = ravel_pytree((state[:4], state.drape))
     external = jnp.zeros(3) if external is None else jnp.asarray(external, jnp.float32)
     shape = (packed.vertices if vertices else 0, 3)
-    kinds = [jax.ShapeDtypeStruct(carried.shape, jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_),
+    kinds = [jax.ShapeDtypeStruct(carried.shape, jnp.float32), jax.ShapeDtypeStruct((len(CAUSES),), jnp.bool_),
              jax.ShapeDtypeStruct(shape, jnp.float32)]  # fmt: skip
     call = jax.ffi.ffi_call(TARGET, kinds, vmap_method="sequential")
-    carried, ok, garment = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose), external)
+    carried, outside, garment = call(packed.file, carried, *(jnp.asarray(x, jnp.float32) for x in pose), external)
     (latent, rotations, positions, translation), drape = restored(carried)
-    return State(latent, rotations, positions, translation, ok, drape), garment if vertices else None
+    return State(latent, rotations, positions, translation, outside, drape), garment if vertices else None

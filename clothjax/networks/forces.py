@@ -73,7 +73,8 @@ def on_vertices(
 
         return -jax.grad(energy)(position)
 
-    elastic = elastic_forces.elastic(position, step.rest, step.material, mesh)
+    material = step.material._replace(bending=0.0) if "bending" in config.without else step.material
+    elastic = elastic_forces.elastic(position, step.rest, material, mesh)
     return jnp.stack([force(MOMENTUM), elastic, force(CONTACT)])
 
 

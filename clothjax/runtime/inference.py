@@ -3,7 +3,7 @@
 A network is reliable only where it was trained. Pose inputs, the character's constants and the code are therefore
 clipped to their range in training. The last pose replaces one that is not finite. The garment stays finite whatever
 comes in, and within a second or two of ordinary input the code forgets the rest. `State.ok` is True for a frame that
-needed none of this.
+needed none of this; else `State.outside` tells which of `models.CAUSES` it was.
 """
 
 import dataclasses
@@ -40,12 +40,18 @@ def initial_state(model: Model, pose: Pose) -> State:
     pose, ok = _sound_or(pose, still)
     rotation, places = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
     rotations, positions, translation = (jnp.stack([x, x]) for x in (pose.rotations, places, pose.translation))
-    state = State(model.network.first, rotations, positions, translation, ok)
+    outside = _outside(ok, True, True, True)
+    state = State(model.network.first, rotations, positions, translation, outside)
     if isinstance(model.network.predictor, PosePredictor):
         return state
     state = state._replace(drape=drape.begin(model, state.latent, _transforms(model, rotation, places)))
     settled = jax.lax.fori_loop(0, SETTLING, lambda _, state: _advanced(model, state, pose, None, False)[0], state)
-    return settled._replace(ok=ok)
+    return settled._replace(outside=outside)
+
+
+def _outside(*inside: Array | bool) -> Array:
+    """Return `State.outside` [4] from whether each of `CAUSES` was within its range."""
+    return ~jnp.stack([jnp.asarray(each) for each in inside])
 
 
 def _sound_or(pose: Pose, other: Pose) -> tuple[Pose, Array]:
@@ -63,7 +69,8 @@ def step(
     Args:
         pose: of the frame to come, local rotations [J, 3, 3] and root translation [3] m.
         vertices: False for a garment that nobody sees: only the state goes on, and the vertices are None.
-        external: [3] m/s^2, an acceleration of the cloth beside gravity, such as wind; only of a Psi with forces.
+        external: [3] m/s^2, an acceleration of the cloth beside gravity, such as wind; only of a Psi with forces. One
+            that is not finite does not push.
 
     Raises:
         ValueError: for an external acceleration of a Psi without forces.
@@ -77,6 +84,10 @@ def _advanced(
     """Compute the next frame as `step` does, which is compiled apart."""
     network, wearer, parents = model.network, model.wearer, np.array(model.parents)
     pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
+    if external is not None:
+        external = jnp.asarray(external, jnp.float32)
+        pushed = jnp.all(jnp.isfinite(external))
+        external, sound = jnp.where(pushed, external, 0.0), sound & pushed
     global_rotations, joints = skinning.forward_kinematics(pose.rotations, wearer.joints, parents)
     rotations, positions, translation = (
         jnp.concatenate([new[None], old])
@@ -97,8 +108,8 @@ def _advanced(
         latent = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
         latent, inside = normalisation.bounded(latent, *network.code_bounds)
         hung, ordinary = drape.follow(model, latent, state.latent, hung, transforms, advance[0]), True
-    ok = sound & ordinary & wearer.known & inside
-    following = State(latent, rotations[:2], positions[:2], translation[:2], ok, hung)
+    outside = _outside(sound, ordinary, wearer.known, inside)
+    following = State(latent, rotations[:2], positions[:2], translation[:2], outside, hung)
     if not vertices:
         return following, None
     return following, drape.shown(model, latent, hung, transforms) + pose.translation[None]
@@ -121,7 +132,7 @@ def predict(predictor: PosePredictor, latent: Array, inputs: Array, bias: Array,
 
 @jax.jit
 def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
-    """Return whether a time step changed nothing (a bool): until the pose changes, no further step is needed.
+    """Return whether a time step changed nothing (a bool): until pose or acceleration change, none is needed.
 
     Args:
         before, after: the states around the step.
@@ -137,23 +148,24 @@ def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
 
 
 @jax.jit
-def step_crowd(model: Model, states: State, poses: Pose) -> tuple[State, Array]:
+def step_crowd(model: Model, states: State, poses: Pose, external: Array | None = None) -> tuple[State, Array]:
     """Compute the next frame of every character of a crowd, as `step` does for one.
 
     Args:
         model: of `crowd`, for N characters.
         states, poses: with a leading axis [N].
+        external: [N, 3] m/s^2, as of `step`.
 
     Returns:
         The new states, and vertices [N, V, 3] m in the world.
     """
 
-    def one(wearer: Wearer, state: State, pose: Pose) -> tuple[State, Array]:
-        state, vertices = step(dataclasses.replace(model, wearer=wearer), state, pose, vertices=True)
+    def one(wearer: Wearer, state: State, pose: Pose, external: Array | None) -> tuple[State, Array]:
+        state, vertices = step(dataclasses.replace(model, wearer=wearer), state, pose, True, external)
         assert vertices is not None
         return state, vertices
 
-    return jax.vmap(one)(model.wearer, states, poses)
+    return jax.vmap(one)(model.wearer, states, poses, external)
 
 
 def animate(model: Model, motion: Motion, external: Array | None = None) -> tuple[Array, Array]:

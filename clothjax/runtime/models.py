@@ -24,6 +24,8 @@ from clothjax.physics import energies
 from clothjax.runtime import trained
 from clothjax.types import Array, Body, Garment, Material, Mesh, Rest
 
+CAUSES = ("not finite", "pose", "wearer", "code")
+"""What may be out of the range of training: a pose that is no pose, the pose's inputs, the character, the code."""
 FORCE_SLACK = 0.0125  # of the range of a code of a Psi with forces, a tenth of a deviation: how far out is still inside
 
 
@@ -167,8 +169,13 @@ class State(NamedTuple):
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first
     positions: Array  # [2, J, 3] m of their joints, from the root's canonical place
     translation: Array  # [2, 3] m
-    ok: Array  # bool, True if the last frame was within the range of training
+    outside: Array  # [4] bool, which of `CAUSES` brought the last frame out of the range of training
     drape: Drape | None = None  # with forces, whose code is not in standard deviations
+
+    @property
+    def ok(self) -> Array:
+        """Return whether the last frame was within the range of training, a bool."""
+        return ~jnp.any(self.outside, axis=-1)
 
 
 def build(

@@ -31,10 +31,14 @@ export class Garment {
     const first = Object.fromEntries(this.names().map((name) => [name, zeros(name)]));
     first.latent = this.tensor("latent", this.about.first_latent);
     this.state = first;
-    const { next_history } = await this.run(rotations, translation);
-    const newest = next_history.data.slice(0, size("history") / 2);
+    const pushed = this.external;
+    this.external = [0, 0, 0];
+    const once = await this.run(rotations, translation);
+    const newest = once.next_history.data.slice(0, size("history") / 2);
     this.state = { ...first, history: this.tensor("history", [...newest, ...newest]) };
+    for (const name of ["garment", "position"]) if (name in first) this.state[name] = once[`next_${name}`];
     for (let i = 0; i < (this.about.settling ?? 0); i++) await this.step(rotations, translation);
+    this.external = pushed;
   }
 
   // Vertices [V * 3] m of the next frame.

@@ -16,7 +16,7 @@
 
 #include "onnxruntime_c_api.h"
 
-enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS, MORE = 5 };
+enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS, CHANGE = INPUTS, GARMENT, POSITION, MORE = 5 };
 enum { NEXT_LATENT, NEXT_HISTORY, OK, OUTPUTS = 4 };
 /* a garment with forces has four more arrays in its state, and is pushed by an external acceleration */
 static const char *const inputs[INPUTS + MORE] = {"latent", "history", "rotations", "translation", "change", "garment",
@@ -153,7 +153,11 @@ int main(int count, char **arguments) {
             check(ort->Run(session, NULL, inputs, given, given_all, outputs, found_all, found));
             memcpy(in[HISTORY].data, out[NEXT_HISTORY].data, half);
             memcpy((char *)in[HISTORY].data + half, out[NEXT_HISTORY].data, half);
-            if (forces) read_array(about, "\"settling\"", &settling, 1);
+            if (forces) {
+                read_array(about, "\"settling\"", &settling, 1);
+                for (int i = GARMENT; i <= POSITION; i++)
+                    memcpy(in[i].data, out[OK + 1 + i - INPUTS].data, in[i].bytes);
+            }
             for (int i = 0; i < (int)settling; i++) {
                 check(ort->Run(session, NULL, inputs, given, given_all, outputs, found_all, found));
                 go_on(in, out, forces);

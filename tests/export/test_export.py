@@ -8,6 +8,7 @@ import sys
 import venv
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from toy import assert_same, small
 
 from clothjax.body import skinning
 from clothjax.commands import convert
-from clothjax.export import litert, native, onnx, onnx_forces, safetensors, stablehlo
+from clothjax.export import frame, litert, native, onnx, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.runtime import inference, specialise
 from clothjax.types import Motion, Pose
@@ -309,6 +310,51 @@ def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):
         _, expected = inference.step(model, state, pose, external=jnp.asarray(external[i]))
         np.testing.assert_allclose(found[i], expected, atol=1e-5)
     assert np.abs(found[0] - found[1]).max() > 1e-4
+
+
+def test_onnx_of_forces_forgets_what_is_not_finite(motion, tmp_path):
+    model = random_force_psi(limit=1e3).model()
+    run = session(onnx.to_onnx(model, tmp_path / "g.onnx"))
+    names = (*onnx.STATE, *onnx_forces.DRAPE)
+    pose = Pose(jnp.asarray(motion.rotations[0]), jnp.asarray(motion.translation[0]))
+    state = onnx.first_state(model, pose)
+    for t in range(1, 8):
+        external = np.array([[np.nan if t == 2 else 0, 0, 0]], np.float32)
+        if t == 4:
+            state[names.index("velocity")] = np.full_like(state[names.index("velocity")], np.nan)
+        given = dict(zip((*names, *onnx.POSE), (*state, motion.rotations[t][None], motion.translation[t][None])))
+        given = {name: np.asarray(x, np.float32) for name, x in given.items()} | {"external": external}
+        *state, ok, vertices = run.run([*(f"next_{name}" for name in names), "ok", "vertices"], given)
+        assert np.isfinite(vertices).all() and (t not in (2, 4) or not ok[0])
+    assert all(np.isfinite(part).all() for part in state) and ok[0]
+
+
+def test_the_first_state_is_as_the_json_says(forced, motion):
+    """Of programs that jax traces: from zeros, as an engine without clothjax begins."""
+    model, clip = forced["skip"], [np.asarray(x[0], np.float32) for x in motion[:2]]
+    run = jax.jit(frame.function(model))
+    given = {name: np.zeros(shape, np.float32) for name, shape in frame.shapes(model).items()}
+    given |= {"rotations": clip[0], "translation": clip[1]}
+    given |= {f"previous_{name}": np.stack([given[name]] * 2) for name in ("rotations",)}
+    given |= {"previous_translations": np.stack([clip[1]] * 2)}
+    names, back = frame.arguments(model), [name.removeprefix("next_") for name in frame.results(model)[:8]]
+    once = dict(zip(frame.results(model), run(*(given[name] for name in names))))
+    given |= {f"previous_{name}": once[f"next_{name}"] for name in ("garment", "position")}
+    for _ in range(inference.SETTLING):
+        found = run(*(given[name] for name in names))
+        given |= {("latent" if name == "latent" else f"previous_{name}"): x for name, x in zip(back, found)}
+    expected = inference.initial_state(model, Pose(*map(jnp.asarray, clip)))
+    apart, begun = (
+        np.linalg.norm(x - expected.drape.position, axis=1).mean()
+        for x in (given["previous_position"], once["next_position"])
+    )
+    assert apart < 0.5 * begun, (apart, begun)
+    assert "Run 60 times" in frame.describe(model)["first_state"]
+
+
+def test_litert_refuses_forces_in_eight_bits(forced, tmp_path):
+    with pytest.raises(ValueError, match="LiteRT has no model with forces in eight bits"):
+        litert.to_litert(forced["skip"], tmp_path / "g.tflite", int8=True)
 
 
 def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):

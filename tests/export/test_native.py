@@ -13,10 +13,11 @@ from jax.flatten_util import ravel_pytree
 from samples import ROOT, apart, random_force_psi, random_model
 
 import clothjax as cj
+from clothjax.body import skinning
 from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
 from clothjax.networks import forces
-from clothjax.runtime import inference, specialise
+from clothjax.runtime import drape, inference, models, specialise
 from clothjax.runtime.models import Layer, State
 from clothjax.types import Pose
 
@@ -92,6 +93,7 @@ def test_c_takes_wild_input_as_the_model_does(library, model, motion, tmp_path):
         for turn, place in zip(rotations[first:], translation[first:]):
             state, vertices = inference.step(exact, state, Pose(jnp.asarray(turn), jnp.asarray(place)))
             assert psi.step(turn, place) == bool(state.ok)
+            assert psi.outside() == tuple(np.array(models.CAUSES)[np.asarray(state.outside)])
             np.testing.assert_allclose(psi.vertices, vertices, atol=2e-4)
             told.append(bool(state.ok))
         assert any(told) == (each is model)
@@ -169,50 +171,53 @@ def of_eight_bits(model):
 
 @pytest.mark.parametrize("name", ["skip", "relu", "mesh"])
 def test_c_with_forces_steps_as_the_model(forced, name, motion):
-    """From the same states, pushed and not, in the median of frames: a vertex between two faces may take the other."""
+    """From the same states, in the median of frames: a vertex between two faces may take the other one."""
     if not psi_ffi.available():
         pytest.skip("needs a C++ compiler")
     model = of_eight_bits(forced[name])
     packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 0))
-    errors = []
+    errors = {None: [], (50.0, 10.0, -30.0): []}
     for t in range(1, 10):
-        external = jnp.array([50.0, 10.0, -30.0]) if t > 5 else None
-        found, vertices = psi_ffi.step(packed, state, at(motion, t), external=external)
-        state, expected = inference.step(model, state, at(motion, t), external=external)
-        of_code = jnp.linalg.norm(found.drape.change - state.drape.change) / jnp.linalg.norm(state.drape.change)
-        moved = jnp.linalg.norm(state.drape.velocity, axis=1).mean()
-        of_rows = [
-            jnp.linalg.norm(x - y, axis=1).mean() / moved
-            for x, y in (
-                (vertices, expected),
-                (found.drape.garment.T, state.drape.garment.T),
-                (found.drape.position, state.drape.position),
-                (found.drape.velocity, state.drape.velocity),
-            )
-        ]
-        errors.append([of_code, *of_rows])
-    of_code, *of_rows = np.median(np.array(errors), axis=0)
-    assert of_code < 0.04 and max(of_rows) < 0.2  # the rows have the rounding of the shapes
+        for external, rows in errors.items():
+            pushed = None if external is None else jnp.array(external)
+            found, vertices = psi_ffi.step(packed, state, at(motion, t), external=pushed)
+            expected, shown = inference.step(model, state, at(motion, t), external=pushed)
+            change = jnp.linalg.norm(found.drape.change - expected.drape.change)
+            moved = jnp.linalg.norm(expected.drape.velocity, axis=1).mean()
+            pairs = [(vertices, shown), *zip(found.drape[2:], expected.drape[2:])]
+            pairs.append((found.drape.garment.T, expected.drape.garment.T))
+            apart = [jnp.linalg.norm(x - y, axis=1).mean() / moved for x, y in pairs]
+            rows.append([change / jnp.linalg.norm(expected.drape.change), *apart])
+        state = expected
+    for rows in errors.values():
+        of_code, *of_rows = np.median(np.array(rows), axis=0)
+        assert of_code < 0.04 and max(of_rows) < 0.2  # the rows have the rounding of the shapes
 
 
 def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):
-    """Bit for bit, seen or not; and the first state has settled as in jax."""
+    """Bit for bit, seen or not, pushed from the middle on; and the first state has settled as in jax."""
     if not psi_ffi.available():
         pytest.skip("needs a C++ compiler")
     model = forced["skip"]
     packed, path = psi_ffi.pack(model), native.to_c(model, tmp_path / "g.psi")
     seen, unseen = (native.Psi(library, path, *map(np.asarray, at(motion, 0))) for _ in range(2))
-    state = None
+    given = inference.initial_state(model, at(motion, 0))
+    _, restored = ravel_pytree((given[:4], given.drape))
+    begun = drape.begin(model, given.latent * 0, inference._transforms(model, *kinematics(model, at(motion, 0))))
+    apart = np.linalg.norm(restored(jnp.asarray(seen.state()))[1].position - given.drape.position, axis=1).mean()
+    assert apart < 0.2 * np.linalg.norm(begun.position - given.drape.position, axis=1).mean()
+    state, external = None, jnp.array([20.0, 0.0, 10.0])
     for t in range(1, 12):
         if t == 6:
             state = seen.state()
+            assert seen.push(external) and unseen.push(external)
         seen.step(*map(np.asarray, at(motion, t)))
         unseen.step(*map(np.asarray, at(motion, t)), vertices=t == 11)
         if t >= 6:
-            given = inference.initial_state(model, at(motion, 0))
-            _, restored = ravel_pytree((given[:4], given.drape))
-            history, drape = restored(jnp.asarray(state))
-            following, vertices = psi_ffi.step(packed, State(*history, given.ok, drape), at(motion, t))
+            history, hung = restored(jnp.asarray(state))
+            before = State(*history, given.outside, hung)
+            following, vertices = psi_ffi.step(packed, before, at(motion, t), external=external)
+            assert np.abs(vertices - psi_ffi.step(packed, before, at(motion, t))[1]).max() > 0
             np.testing.assert_array_equal(vertices, seen.vertices)
             state = seen.state()
             np.testing.assert_array_equal(ravel_pytree((following[:4], following.drape))[0], state)
@@ -221,11 +226,46 @@ def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):
 
 def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path):
     """Cut short anywhere, or with an index that points beyond."""
-    whole, path = native.packed(forced["mesh"]), tmp_path / "g.psi"
-    for cut in np.linspace(100, len(whole) - 64, 40).astype(int):
-        path.write_bytes(whole[:cut])
+    arrays, path = list(native._arrays(forced["mesh"])), tmp_path / "g.psi"
+    whole = native.as_bytes(arrays)
+    tables = [i for i, array in enumerate(arrays) if array.dtype == np.int32 and array.ndim == 2]
+    assert len(tables) == 4  # corners, hinges, faces of the body, candidates
+    wrong = [whole[:cut] for cut in np.linspace(100, len(whole) - 64, 40).astype(int)]
+    for table in tables:
+        for value in (-1, 1 << 18):
+            changed = arrays[table].copy()
+            changed[1, 5] = value
+            wrong.append(native.as_bytes([*arrays[:table], changed, *arrays[table + 1 :]]))
+    for damaged in wrong:
+        path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"g\.psi: (a damaged \.psi|not a \.psi|the file cannot be read)"):
             native.Psi(library, path, *map(np.asarray, at(motion, 0)))
+
+
+def test_more_vertices_than_plain_c_takes_are_refused(forced, monkeypatch):
+    monkeypatch.setattr(native, "MOST_WIDTH", 3000)
+    with pytest.raises(ValueError, match=r"plain C takes 1000 vertices of a garment with forces, not 1016"):
+        native.packed(forced["relu"])
+
+
+def test_what_is_not_finite_is_told_and_forgotten(library, motion, tmp_path):
+    """An acceleration, and a state that is lost."""
+    path = native.to_c(random_force_psi(limit=1e3).model(), tmp_path / "g.psi")
+    psi = native.Psi(library, path, *map(np.asarray, at(motion, 0)))
+    assert psi.push([np.nan, 0, 0]) and not psi.step(*map(np.asarray, at(motion, 1)))
+    assert psi.outside() == ("not finite",)
+    assert psi.push([0, 0, 0]) and psi.step(*map(np.asarray, at(motion, 2)))
+    state = psi.state()
+    state[-5:] = np.nan  # of the velocities
+    psi.put_back(state)
+    assert not psi.step(*map(np.asarray, at(motion, 3))) and psi.outside() == ("code",)
+    for t in range(4, 8):
+        psi.step(*map(np.asarray, at(motion, t)))
+    assert np.isfinite(psi.vertices).all() and np.isfinite(psi.state()).all()
+
+
+def kinematics(model, pose):
+    return skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
 
 
 def at(motion, frame):

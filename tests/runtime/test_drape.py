@@ -72,7 +72,6 @@ def test_vertices_are_its_garment_in_the_world(model, motion):
 
 
 def test_an_acceleration_against_gravity_is_no_gravity(forced, motion):
-    """And one aside moves the cloth aside."""
     model, light = forced.model(), random_force_psi(without=("gravity",)).model()
     first = inference.initial_state(light, pose(motion, 0))
     free = inference.step(light, first, pose(motion, 1))[1]
@@ -141,6 +140,8 @@ def test_it_stays_finite_whatever_comes_in(model, motion):
     assert np.isfinite(vertices).all() and not state.ok
     state, vertices = inference.step(model, state, pose(motion, 1)._replace(translation=jnp.array([1e3, 0, 0])))
     assert np.isfinite(vertices).all()
+    state, vertices = inference.step(model, state, pose(motion, 1), external=jnp.array([np.nan, 0.0, 0.0]))
+    assert np.isfinite(vertices).all() and state.outside.tolist()[0]
     lost = state.drape._replace(velocity=jnp.full_like(state.drape.velocity, np.nan))
     state, vertices = inference.step(model, state._replace(drape=lost), pose(motion, 2))
     assert np.isfinite(vertices).all() and not state.ok

@@ -152,7 +152,7 @@ def test_the_state_says_nothing_of_the_frames_before_the_last_two(trained):
     state = inference.initial_state(model, pose)
     size = sum(x.size for x in jax.tree.leaves(state))
     joints = motion.rotations.shape[1]
-    assert size == state.latent.size + 2 * (9 * joints + 3 * joints + 3) + 1
+    assert size == state.latent.size + 2 * (9 * joints + 3 * joints + 3) + len(models.CAUSES)
 
 
 def test_a_frame_that_is_not_finite_is_the_last_one_again(trained):
@@ -201,6 +201,31 @@ def test_what_training_has_not_seen_is_said_and_leaves_the_code_where_training_h
         told.append(bool(state.ok))
         assert np.isfinite(vertices).all() and float(jnp.abs(state.latent).max()) <= 0.5
     assert not all(told)
+
+
+def test_the_state_tells_what_was_out_of_the_range_of_training(trained):
+    model, motion, _, wearer = trained
+    pose = Pose(jnp.asarray(motion.rotations[1]), jnp.asarray(motion.translation[1]))
+    bounds = model.network.code_bounds
+    strict = bounds._replace(low=0 * bounds.low - 1e-6, high=0 * bounds.high + 1e-6, slack=0 * bounds.slack)
+    cases = {
+        "not finite": (model, pose._replace(translation=jnp.full(3, np.nan))),
+        "pose": (model, pose._replace(translation=pose.translation + 1e5)),
+        "wearer": (wearer(np.full(10, 9.0)), pose),
+        "code": (dataclasses.replace(model, network=model.network._replace(code_bounds=strict)), pose),
+    }
+    assert set(cases) == set(models.CAUSES)
+    usual = bounds._replace(low=0 * bounds.low - 1e9, high=0 * bounds.high + 1e9)
+    for cause, (each, asked) in cases.items():
+        if cause != "code":  # what is unlike training may bring the code out too
+            each = dataclasses.replace(each, network=each.network._replace(code_bounds=usual))
+        state = inference.initial_state(
+            each, Pose(jnp.asarray(motion.rotations[0]), jnp.asarray(motion.translation[0]))
+        )
+        state, _ = inference.step(each, state, asked)
+        assert np.array(models.CAUSES)[np.asarray(state.outside)].tolist() == [cause] and not state.ok
+    state, _ = inference.step(model, inference.initial_state(model, pose), pose)
+    assert state.ok and not np.asarray(state.outside).any()
 
 
 def test_a_wearer_or_a_cloth_outside_the_range_of_training_is_said(trained):
