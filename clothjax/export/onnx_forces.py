@@ -120,18 +120,9 @@ def _momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
 
 def _elasticity(g: Graph, model: Model, it: Parts, held: str) -> str:
     """Elastic forces [N, 3, V] in N, as of `elastic_forces.elastic`."""
-    mesh, vertices = it.predictor.mesh, it.template.shape[1]
+    mesh, table = it.predictor.mesh, np.asarray(it.predictor.around, np.int64)
     gradients = _stretching(g, it, held, np.asarray(mesh.faces))
-    corners = [np.asarray(mesh.faces).T.reshape(-1), np.asarray(mesh.hinges).T.reshape(-1)]
-    if "bending" in model.config.physics.without:
-        corners = corners[:1]
-    else:
-        gradients += _bending(g, it, held, np.asarray(mesh.hinges))
-    corners = np.concatenate(corners)
-    # a sum over a table: the elements of each vertex, padded with one that is zero
-    order, counts = np.argsort(corners, kind="stable"), np.bincount(corners, minlength=vertices)
-    table = np.full((vertices, counts.max()), len(corners))
-    table[np.repeat(np.arange(vertices), counts), np.concatenate([np.arange(count) for count in counts])] = order
+    gradients += _bending(g, model, it, held, np.asarray(mesh.hinges))
     rows = g("Pad", g("Concat", *gradients, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
     gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 3, *table.shape)
     return g("Neg", g("ReduceSum", gathered, np.array([3], np.int64), keepdims=0))
@@ -159,7 +150,7 @@ def _stretching(g: Graph, it: Parts, held: str, faces: np.ndarray) -> list[str]:
     return [first, second, g("Neg", g("Add", first, second))]
 
 
-def _bending(g: Graph, it: Parts, held: str, hinges: np.ndarray) -> list[str]:
+def _bending(g: Graph, model: Model, it: Parts, held: str, hinges: np.ndarray) -> list[str]:
     """Gradients [N, 3, H] of the bending energy for the edge's ends and the two vertices opposite."""
     rest = it.cloth.rest
     start, end, *opposite = (g("Gather", held, hinges[:, k], axis=2) for k in range(4))
@@ -178,7 +169,8 @@ def _bending(g: Graph, it: Parts, held: str, hinges: np.ndarray) -> list[str]:
     sine = g("Where", g("Equal", sine, np.float32(0.0)), np.float32(1e-30), sine)  # folded over: half a turn
     half = g("Div", sine, g("Max", g("Add", radius, cosine), np.float32(1e-37)))
     angle = g("Sub", g("Mul", g("Atan", half), np.float32(2.0)), np.asarray(rest.hinge_angle))
-    stiff = float(it.cloth.material.bending) / (4.0 * np.asarray(rest.hinge_area))
+    bending = 0.0 if "bending" in model.config.physics.without else float(it.cloth.material.bending)
+    stiff = bending / (4.0 * np.asarray(rest.hinge_area))
     weight = g("Mul", g("Cast", bent, to=g.onnx.TensorProto.FLOAT), stiff)
     torque = g("Mul", g("Mul", g("Mul", weight, squared), angle), length)
     tips = [g("Mul", g("Neg", g("Div", torque, x)), y) for x, y in zip(squares, normals, strict=True)]

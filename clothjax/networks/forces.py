@@ -54,6 +54,7 @@ def on_vertices(
     surface: tuple[Array, Array] | None,
     candidates: Array,
     mesh: Mesh,
+    around: Array,
     config: PhysicsConfig,
 ) -> Array:
     """Return the forces [3, V, 3] in N on a garment: for each of `KINDS`, minus the gradient of its energies.
@@ -63,6 +64,7 @@ def on_vertices(
         step: the time step; its contact is not used.
         surface: as of `felt`; None where there is no body to touch.
         candidates: [V, K] int32, as of `felt`.
+        around: [V, D] int32, of `elastic_forces.around` for the mesh.
     """
     step = step._replace(contact=None if surface is None else felt(position, surface, candidates))
 
@@ -74,7 +76,7 @@ def on_vertices(
         return -jax.grad(energy)(position)
 
     material = step.material._replace(bending=0.0) if "bending" in config.without else step.material
-    elastic = elastic_forces.elastic(position, step.rest, material, mesh)
+    elastic = elastic_forces.elastic(position, step.rest, material, mesh, around)
     return jnp.stack([force(MOMENTUM), elastic, force(CONTACT)])
 
 
@@ -91,7 +93,9 @@ def reduced(
 
     Args:
         garment: from a code to vertices [V, 3] m at the next frame.
+        mesh: on the host.
     """
     position, pullback = jax.vjp(garment, code)
-    forces = on_vertices(position, step, surface, candidates, mesh, config)
+    around = elastic_forces.around(mesh, len(position))
+    forces = on_vertices(position, step, surface, candidates, mesh, around, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

@@ -83,7 +83,9 @@ def predict(
         timestep=jnp.float32(timestep),
     )
     surface = contact_search.centroids(posed, parts.faces)
-    on_vertices = forces.on_vertices(held, step, surface, parts.scales.candidates, parts.mesh, config.physics)
+    on_vertices = forces.on_vertices(
+        held, step, surface, parts.scales.candidates, parts.mesh, parts.around, config.physics
+    )
     carried_back = jnp.einsum("abv,kva->kbv", rows[:, :3], on_vertices, precision=HIGHEST)
     on_weights = jnp.matmul(carried_back.reshape(len(forces.KINDS), -1), felt.shapes.T, precision=HIGHEST)
     _, pullback = jax.vjp(lambda code: blend_weights(model.network, code, config), latent)

@@ -20,7 +20,7 @@ from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
-from clothjax.physics import energies
+from clothjax.physics import elastic_forces, energies
 from clothjax.runtime import trained
 from clothjax.types import Array, Body, Garment, Material, Mesh, Rest
 
@@ -77,6 +77,7 @@ class ForcePredictor(NamedTuple):
     params: dict  # of `psi.ForcePsi`
     scales: ForceScales
     mesh: Mesh  # of the garment's elements
+    around: Array  # [V, D] int32, of `elastic_forces.around`
     faces: Array  # [F, 3] int32 of the part of the body that can be touched
     body: Array  # [J', B] skinning weights of that part
     corrections: Array | None  # [B, 3, 9 (J - 1)] m, its pose blend shapes
@@ -211,13 +212,14 @@ def build(
     cloth = config.material
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
-    touched = mesh = None
+    touched = mesh = around = None
     if isinstance(normalizers, ForceScales):
         touched, candidates = _touched(garment, body, normalizers.candidates, config)
         normalizers = normalizers._replace(candidates=candidates)
         mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
+        around = elastic_forces.around(mesh, len(garment.vertices))
     network, wearer = _arrays(
-        garment, body, touched, mesh, garment_params, predictor, normalizers, betas, material, config
+        garment, body, touched, mesh, around, garment_params, predictor, normalizers, betas, material, config
     )
     return Model(
         network=network,
@@ -247,6 +249,7 @@ def _arrays(
     body: Body,
     touched: Body | None,
     mesh: Mesh | None,
+    around: Array | None,
     garment_params: dict,
     predictor: dict,
     normalizers: Normalizers | ForceScales,
@@ -258,20 +261,20 @@ def _arrays(
 
     Args:
         touched: the part of the body that is felt, and ...
-        mesh: ... the elements that feel; None without forces.
+        mesh, around: ... the elements that feel; None without forces.
     """
     given = psi.constant_inputs(betas, material, config.material)
     constants, known = psi.bounded_constants(given, config)
     template = skinning.shaped_vertices(garment, betas)
     bias, cloth, latent = jnp.zeros(0), None, None
     if isinstance(normalizers, ForceScales):
-        assert touched is not None and mesh is not None
+        assert touched is not None and mesh is not None and around is not None
         rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
         shaped = skinning.shaped_vertices(touched, betas)
         cloth = Cloth(constants, areas * material.density, rest, material, shaped, None)
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
-        parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, weights, corrections, None)
+        parts = ForcePredictor(predictor, normalizers, mesh, around, touched.faces, weights, corrections, None)
         bounds = Bounds(normalizers.low, normalizers.high, FORCE_SLACK * (normalizers.high - normalizers.low))
         first = jnp.zeros(len(normalizers.low))
     else:

@@ -280,6 +280,7 @@ def forced():
     mesh = specialise.on_mesh(skip.model(), skip.experiment.garment, np.zeros(10))
     few = specialise.specialise(relu.model(betas=np.ones(10)), blendshapes=7)
     return {
+        "limp": random_force_psi(without=("bending", "gravity")).model(),
         "skip": skip.model(),
         "relu": relu.model(betas=np.ones(10)),
         "mesh": specialise.specialise(mesh),
@@ -287,7 +288,7 @@ def forced():
     }
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few"])
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few", "limp"])
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)

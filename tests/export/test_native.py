@@ -142,7 +142,7 @@ def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
 @pytest.fixture(scope="module")
 def forced():
     """Models of a random Psi with forces: a skip, a ReLU on the weights, and another mesh with few shapes."""
-    skip, relu = random_force_psi(), random_force_psi(skip=False)
+    skip, relu = random_force_psi(), random_force_psi(skip=False, without=("bending",))
     mesh = specialise.on_mesh(relu.model(), relu.experiment.garment, np.zeros(10))
     return {
         "skip": specialise.specialise(skip.model(betas=np.ones(10))),
