@@ -57,6 +57,7 @@ def test_skinning_has_an_energy_gap_of_one_and_the_solver_none(walking):
     assert abs(gaps["energy_gap"]) < 1e-3 and gaps["hold_gap"] < 0.05 and gaps["step_error_mm"] < 1.0
 
 
+@pytest.mark.slow
 def test_an_acceleration_against_gravity_is_no_gravity(walking):
     """For the solver, and for the measure of its own steps; in frames where it pushes, and only there."""
     experiment, character, poses = walking

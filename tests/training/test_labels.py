@@ -281,6 +281,7 @@ def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
     np.testing.assert_allclose(fitted, targets, atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of):
     """The code that a rollout stores is the one that labelling counts as Psi's."""
     experiment, clips, params, blank = toy
