@@ -99,16 +99,16 @@ def pose_body(
 ) -> Float[Array, "B 3"]:
     """Posed vertices [B, 3] m of a body shaped to `vertices` [B, 3] and `joints` [J, 3], translation included."""
     transforms = joint_transforms(pose.rotations, joints, body.parents)
-    moved = apply(blend(body.weights, transforms), pose_corrected(body, vertices, pose))
+    moved = apply(blend(body.weights, transforms), pose_corrected(body.posedirs, vertices, pose))
     return moved + pose.translation[None]
 
 
-def pose_corrected(body: Body, vertices: Float[Array, "B 3"], pose: Pose) -> Float[Array, "B 3"]:
-    """Canonical vertices [B, 3] m with SMPL's pose blend shapes added, where the body has them."""
-    if body.posedirs is None:
+def pose_corrected(posedirs: Array | None, vertices: Float[Array, "B 3"], pose: Pose) -> Float[Array, "B 3"]:
+    """Canonical vertices [B, 3] m with SMPL's pose blend shapes [B, 3, 9 (J - 1)] added, where there are any."""
+    if posedirs is None:
         return vertices
     features = (pose.rotations[1:] - jnp.eye(3, dtype=vertices.dtype)[None]).reshape(-1)
-    return vertices + jnp.einsum("ncp,p->nc", body.posedirs, features, precision=HIGHEST)
+    return vertices + jnp.einsum("ncp,p->nc", posedirs, features, precision=HIGHEST)
 
 
 def vertex_normals(vertices: Float[Array, "N 3"], faces: Int[Array, "F 3"]) -> Float[Array, "N 3"]:

@@ -83,6 +83,8 @@ struct psi_state {
 
 /* reading */
 
+static int32_t padded(int32_t count) { return (count + LANES - 1) / LANES * LANES; }
+
 typedef struct {
     const uint8_t *bytes;
     size_t left;
@@ -142,7 +144,9 @@ static bounds read_bounds(reader *r, int32_t count) {
     return b;
 }
 
-static int takes(const layer *l, int32_t inputs, int32_t outputs) { return l->inputs == inputs && l->outputs == outputs; }
+static int takes(const layer *l, int32_t inputs, int32_t outputs) {
+    return l->inputs == inputs && l->outputs == outputs;
+}
 
 static int takes_exact(const exact *e, int32_t inputs, int32_t outputs) {
     return takes(&e->coarse, inputs, outputs) && takes(&e->fine, inputs, outputs);
@@ -153,7 +157,9 @@ static int fits_forces(const psi_model *m) {
     const forces *f = &m->f;
     const int32_t code = m->code, last = m->decode[m->decoder - 1].outputs;
     int good = takes(&f->read_fine, code, m->read.outputs) && m->read.outputs > 0 && m->shapes.inputs > 0 && last > 0;
-    good &= takes(&f->unshape, 3 * f->vertices, m->shapes.inputs) && (!m->mixed || takes(&f->unmix, m->mix.outputs, last));
+    good &= takes(&f->unshape, 3 * f->vertices, m->shapes.inputs);
+    good &= !m->mixed || takes(&f->unmix, m->mix.outputs, last);
+    good &= m->apart ? takes(&f->felt_shapes, m->shapes.inputs, 3 * f->vertices) : f->vertices == m->vertices;
     for (int32_t i = 0; i < m->decoder; i++)
         good &= m->decode[i].outputs > 0 && takes(&f->undecode[i], m->decode[i].outputs, m->decode[i].inputs);
     good &= takes_exact(&f->unread, m->read.outputs, code) && takes_exact(&f->change, code, code) &&
@@ -164,7 +170,7 @@ static int fits_forces(const psi_model *m) {
         good &= m->then[i].inputs == width;
         width = m->then[i].outputs;
     }
-    return good && width == code && (m->apart ? takes(&f->felt_shapes, m->shapes.inputs, 3 * f->vertices) : f->vertices == m->vertices);
+    return good && width == code;
 }
 
 /* Whether every layer takes what there is for it. */
@@ -200,8 +206,6 @@ static exact read_exact(reader *r, psi_model *m) {
     e.fine = read_layer(r, m);
     return e;
 }
-
-static int32_t padded(int32_t count) { return (count + LANES - 1) / LANES * LANES; }
 
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
@@ -260,7 +264,7 @@ static void read_model(reader *r, psi_model *m) {
     m->input = indices(r, m->kept, m->joints);
     m->bone = indices(r, m->moving, m->joints);
     m->rest = floats(r, 3 * (size_t)m->joints);
-    m->weight = floats(r, (size_t)m->moving * ((m->vertices + LANES - 1) / LANES * LANES));
+    m->weight = floats(r, (size_t)m->moving * padded(m->vertices));
     m->forced = head[13];
     int32_t poses = m->forced ? 0 : 6 + 18 * m->kept + 9 * (m->kept - 1);
     m->pose_mean = floats(r, poses);
@@ -512,19 +516,25 @@ static void bones(const psi_model *m, psi_state *s) {
     }
 }
 
+/* LANES vertices at x, y, z with weights [moving][wide], skinned; added to `moved`, zeros before. */
+static void skin_lanes(const psi_model *m, const psi_state *s, const float *weight, size_t wide, const float *x,
+                       const float *y, const float *z, float moved[3][LANES]) {
+    for (int32_t k = 0; k < m->moving; k++) {
+        const float *w = weight + k * wide, *a = s->skinning + 12 * k;
+        for (int i = 0; i < LANES; i++) {
+            moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
+            moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
+            moved[2][i] += w[i] * (a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11]);
+        }
+    }
+}
+
 static void skin(const psi_model *m, psi_state *s, const float *garment, float *vertices) {
     const int32_t count = m->vertices, wide = padded(count);
     for (int32_t v = 0; v < count; v += LANES) {
         const float *x = garment + v, *y = x + count, *z = y + count;
         float moved[3][LANES] = {{0}}, shown[LANES][3];
-        for (int32_t k = 0; k < m->moving; k++) {
-            const float *w = m->weight + (size_t)k * wide + v, *a = s->skinning + 12 * k;
-            for (int i = 0; i < LANES; i++) {
-                moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
-                moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
-                moved[2][i] += w[i] * (a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11]);
-            }
-        }
+        skin_lanes(m, s, m->weight + v, wide, x, y, z, moved);
         for (int i = 0; i < LANES; i++)
             for (int c = 0; c < 3; c++) shown[i][c] = moved[c][i] + s->translation[c];
         memcpy(vertices + 3 * v, shown, 3 * sizeof(float) * (count - v < LANES ? count - v : LANES));
@@ -603,14 +613,7 @@ static void pose_body(const psi_model *m, psi_state *s, const float *advance) {
     for (int32_t v = 0; v < wide; v += LANES) {
         const float *x = f->body_rest + v, *y = x + wide, *z = y + wide;
         float moved[3][LANES] = {{0}};
-        for (int32_t k = 0; k < m->moving; k++) {
-            const float *w = f->body_weight + (size_t)k * wide + v, *a = s->skinning + 12 * k;
-            for (int i = 0; i < LANES; i++) {
-                moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
-                moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
-                moved[2][i] += w[i] * (a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11]);
-            }
-        }
+        skin_lanes(m, s, f->body_weight + v, wide, x, y, z, moved);
         for (int c = 0; c < 3; c++)
             for (int i = 0; i < LANES; i++) s->body[c * wide + v + i] = moved[c][i] + advance[c];
     }
@@ -688,7 +691,7 @@ static void push_contact(const psi_model *m, psi_state *s, float *force) {
     }
 }
 
-/* Corners of elements [count][3][LANES], from rows [3][wide]; and the same, back, added. */
+/* Corners of elements [count][3][LANES], from rows [3][wide]; and gradients there, taken from the force. */
 static void gather(const float *rows, size_t wide, const int32_t *index, size_t stride, int count,
                    float to[][3][LANES]) {
     for (int k = 0; k < count; k++)
@@ -736,8 +739,8 @@ static void push_stretching(const forces *f, const float *held, float *force) {
 
 /* The arc tangent of y / x (Abramowitz and Stegun 4.4.49), without a branch. */
 static inline float arc(float y, float x) {
-    const float a = fabsf(x), b = fabsf(y), more = a > b ? a : b, less = a > b ? b : a, q = more > 0.0f ? less / more : 0.0f,
-                t = q * q;
+    const float a = fabsf(x), b = fabsf(y), more = a > b ? a : b, less = a > b ? b : a;
+    const float q = more > 0.0f ? less / more : 0.0f, t = q * q;
     float angle = q * (1.0f + t * (-0.3333314528f + t * (0.1999355085f + t * (-0.1420889944f + t * (0.1065626393f +
                   t * (-0.0752896400f + t * (0.0429096138f + t * (-0.0161657367f + t * 0.0028662257f))))))));
     angle = b > a ? 1.57079633f - angle : angle;

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search
 from clothjax.physics.energies import bending, collision, friction, gravity, inertia, stretching
-from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, SelfContact
+from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, Scalar, SelfContact
 
 FRICTION_RADIUS = 3e-3  # m, a distance (HOOD compares its square with this)
 FRICTION_SMOOTHING = 1e-4  # m
@@ -43,6 +43,16 @@ LAWS = Laws()
 def touching(position: Float[Array, "V 3"], contact: Contact) -> Bool[Array, " V"]:
     """Return which vertices [V, 3] m are less than `FRICTION_RADIUS` from their contact planes: a mask [V]."""
     return contact_search.distance(position, contact.point, contact.normal) < FRICTION_RADIUS
+
+
+def pushed(velocity: Float[Array, "V 3"], timestep: Scalar, external: Array | None) -> Float[Array, "V 3"]:
+    """Return velocities [V, 3] m per step with which an external acceleration enters inertia: v + a h^2.
+
+    Args:
+        timestep: s.
+        external: [3] m/s^2, or None.
+    """
+    return velocity if external is None else velocity + timestep**2 * external[None]
 
 
 def elements(

@@ -6,9 +6,10 @@ Garments are [3, V], coordinate by coordinate, because processors are fast at lo
 import jax
 import jax.numpy as jnp
 
+from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.networks import forces, psi
-from clothjax.physics import contact_search
+from clothjax.physics import contact_search, incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network, Shown
 from clothjax.types import Array, Pose
@@ -67,14 +68,11 @@ def predict(
     felt, _ = _felt(model)
     rows, timestep = _rows(felt.weights, transforms), 1.0 / config.fps
     held = (_skin(rows, drape.garment) + advance[:, None]).T
-    body = cloth.body
-    if parts.corrections is not None:
-        turned = (pose.rotations[1:] - jnp.eye(3)[None]).reshape(-1)
-        body += jnp.einsum("ncp,p->nc", parts.corrections, turned, precision=HIGHEST)
+    body = skinning.pose_corrected(parts.corrections, cloth.body, pose)
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
     step = TimeStep(
         position=drape.position,
-        velocity=drape.velocity if external is None else drape.velocity + timestep**2 * external[None],
+        velocity=incremental_potential.pushed(drape.velocity, timestep, external),
         mass=cloth.mass,
         rest=cloth.rest,
         material=cloth.material,

@@ -102,12 +102,13 @@ def _advanced(
         inputs = psi.pose_inputs(rotations, positions, advance, np.array(model.input_joints), model.config.fps)
         inputs, ordinary = normalisation.bounded(inputs - network.predictor.pose_mean, *network.predictor.pose_bounds)
         latent = predict(network.predictor, state.latent, inputs, wearer.bias, model.config)
-        latent, inside = normalisation.bounded(latent, *network.code_bounds)
     else:
         assert hung is not None
+        ordinary = True
         latent = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
-        latent, inside = normalisation.bounded(latent, *network.code_bounds)
-        hung, ordinary = drape.follow(model, latent, state.latent, hung, transforms, advance[0]), True
+    latent, inside = normalisation.bounded(latent, *network.code_bounds)
+    if hung is not None:
+        hung = drape.follow(model, latent, state.latent, hung, transforms, advance[0])
     outside = _outside(sound, ordinary, wearer.known, inside)
     following = State(latent, rotations[:2], positions[:2], translation[:2], outside, hung)
     if not vertices:

@@ -106,6 +106,12 @@ class Network(NamedTuple):
         return isinstance(self.read, FoldedLayer)
 
     @property
+    def readers(self) -> tuple[Layer, Layer] | None:
+        """The two layers that alone read the code: of a pose predictor and of the decoder; None if it is otherwise."""
+        code = self.predictor.code if isinstance(self.predictor, PosePredictor) else None
+        return (code, self.read) if isinstance(code, Layer) and isinstance(self.read, Layer) else None
+
+    @property
     def width(self) -> int:
         """Outputs [D] of the decoder's first layer; further outputs of `read` are the skip."""
         return len(self.decoder[0].kernel)

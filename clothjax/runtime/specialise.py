@@ -55,14 +55,10 @@ def without_code(model: Model) -> Model:
     A linear layer gives the code and two layers read it: the predictor's first in the next frame, and the decoder's.
     A predictor with forces reads more than the code, which then stays.
     """
-    network, predictor, read = model.network, model.network.predictor, model.network.read
-    if (
-        isinstance(predictor, ForcePredictor)
-        or isinstance(predictor.code, FoldedLayer)
-        or isinstance(read, FoldedLayer)
-    ):
+    network, predictor = model.network, model.network.predictor
+    if network.readers is None or not isinstance(predictor, PosePredictor):
         return model
-    code = predictor.code
+    code, read = network.readers
     readers = jnp.concatenate([code.kernel, read.kernel], axis=1)
     *hidden, last = predictor.hidden
     folded = Layer(_product(last.kernel, readers), _product(last.bias, readers))
@@ -119,14 +115,9 @@ def _equalised_shapes(network: Network, limits: np.ndarray) -> Network:
 
 def _equalised_code(network: Network) -> Network:
     """Scale the code, and the kernels that read it by the inverse; one folded or with forces is returned as it is."""
-    predictor, read = network.predictor, network.read
-    if (
-        isinstance(predictor, ForcePredictor)
-        or isinstance(predictor.code, FoldedLayer)
-        or isinstance(read, FoldedLayer)
-    ):
+    if network.readers is None:
         return network
-    code = predictor.code
+    code, read = network.readers
     limits = np.maximum(-np.asarray(network.code_bounds.low), np.asarray(network.code_bounds.high))
     scale = smoothing_scale(limits, jnp.concatenate([code.kernel, read.kernel], axis=1))
     network = _divided_code(network, scale)

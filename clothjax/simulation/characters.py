@@ -86,7 +86,7 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
     transforms = transforms.at[:, :, 3].add(pose.translation[None])
     body = skinning.apply(
         skinning.blend(scene.body.weights, transforms),
-        skinning.pose_corrected(scene.body, character.body, pose),
+        skinning.pose_corrected(scene.body.posedirs, character.body, pose),
     )
     normals = skinning.vertex_normals(body, scene.body.faces)
     root = int(np.flatnonzero(np.asarray(scene.body.parents) < 0)[0])

@@ -65,7 +65,7 @@ def time_step(
         on_self = contact_search.find_on_self(state.position, scene.garment_patches)
     return TimeStep(
         position=state.position,
-        velocity=state.velocity if external is None else state.velocity + timestep**2 * external[None],
+        velocity=incremental_potential.pushed(state.velocity, timestep, external),
         mass=character.mass,
         rest=character.rest,
         material=character.material,
