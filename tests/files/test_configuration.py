@@ -55,6 +55,21 @@ def load(folder, text, *overrides):
     return configuration.load(Config, write(folder, "c.yaml", text), overrides)
 
 
+@pytest.mark.parametrize(
+    ("other", "reason"),
+    [
+        ({"physics": {"body": "still"}}, "needs a body that moves"),
+        ({"physics": {"body": "none"}}, "needs a body that moves"),
+        ({"peer": {"network": "direct"}, "stage1": {"start_timestep": 0.0}}, "is not of a baseline"),
+        ({"model": {"latent_update": "absolute"}}, "needs the inverse Hessian"),
+    ],
+)
+def test_forces_need_a_moving_body_and_phis_descent(other, reason):
+    assert configuration.from_dict(config_module.Config, {"stage2": {"forces": True}}).stage2.forces
+    with pytest.raises(ValueError, match=reason):
+        configuration.from_dict(config_module.Config, {"stage2": {"forces": True}} | other)
+
+
 SECTIONS = [cls for cls in vars(config_module).values() if hasattr(cls, "RETIRED")]
 
 

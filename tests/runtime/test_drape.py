@@ -126,10 +126,13 @@ def test_a_crowd_is_each_of_its_characters(forced, motion):
     poses = Pose(jnp.asarray(motion.rotations[[0, 5]], jnp.float32), jnp.asarray(motion.translation[[0, 5]]))
     each = [inference.initial_state(model, jax.tree.map(lambda x, i=i: x[i], poses)) for i, model in enumerate(wearers)]
     states = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    _, together = inference.step_crowd(models.crowd(wearers), states, poses)
+    external = jnp.array([[0.0, 0.0, 0.0], [30.0, 0.0, -10.0]])
+    _, together = inference.step_crowd(models.crowd(wearers), states, poses, external)
     for i, model in enumerate(wearers):
-        _, alone = inference.step(model, each[i], jax.tree.map(lambda x, i=i: x[i], poses))
+        mine = jax.tree.map(lambda x, i=i: x[i], poses)
+        _, alone = inference.step(model, each[i], mine, external=external[i])
         np.testing.assert_allclose(together[i], alone, atol=1e-5)
+    assert np.abs(together[1] - inference.step(wearers[1], each[1], mine)[1]).max() > 1e-4
 
 
 def test_it_stays_finite_whatever_comes_in(model, motion):

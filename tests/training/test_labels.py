@@ -188,27 +188,34 @@ def test_an_external_acceleration_moves_free_cloth_as_gravity_would(problem, toy
 
 
 @pytest.mark.slow
-def test_a_simulation_that_is_pushed_feels_it(toy, monkeypatch):
-    """The momentum of the first frame is that of a time step with the acceleration that was drawn."""
+@pytest.mark.parametrize("stands", [False, True])
+def test_a_simulation_feels_what_pushes_it_and_whether_its_body_moves(toy, monkeypatch, stands):
+    """The momentum of the first frame is that of a time step with the acceleration that was drawn, on that body."""
     experiment, clips, params, blank = toy
     scene, config = experiment.scene, experiment.config
     push = jnp.array([3.0, GRAVITY, -2.0])
     monkeypatch.setattr(labels, "draw_external", lambda *_: push)
-    pushed = collected(toy, labels.make_collect(scene, clips, config), blank).labels
+    monkeypatch.setattr(labels, "STILL", 1.0 if stands else 0.0)
+    after, pushed = collected(toy, labels.make_collect(scene, clips, config), blank)
     simulation = pool.begin(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
     character = pool.dressed(scene, simulation.betas, simulation.material, config)
-    poses = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
-    window = characters.window(scene, character, poses)
-    garment = partial(phi.decode, params["garment"], scene, character, window=window, config=config.model)
+    moves = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
 
-    def momentum(external):
+    def momentum(poses, external):
+        window = characters.window(scene, character, poses)
+        garment = partial(phi.decode, params["garment"], scene, character, window=window, config=config.model)
         step = time_step.time_step(scene, character, simulation.cloth, window, 1 / config.fps, config, external)
         held, near = simulation.cloth.latent, blank.normalizers.candidates
         return reduced(lambda z: garment(latent=z), held, step, window, scene, near)[0]
 
-    expected = momentum(push)
-    np.testing.assert_allclose(pushed.forces[0, 0], expected, atol=1e-3 * float(jnp.abs(expected).max()))
-    assert np.abs(expected - momentum(None)).max() > 0.1 * np.abs(expected).max()
+    still = motion_clips.standing(moves)
+    mine, other = (still, moves) if stands else (moves, still)
+    expected = momentum(mine, push)
+    most = float(jnp.abs(expected).max())
+    np.testing.assert_allclose(pushed.forces[0, 0], expected, atol=1e-3 * most)
+    assert min(np.abs(expected - momentum(*wrong)).max() for wrong in ((mine, None), (other, push))) > 0.01 * most
+    first = labels.begin(scene, clips, config).frame
+    assert (after.frame == first + (0 if stands else 5)).any()  # the others began anew
 
 
 def test_external_accelerations_are_mostly_none_else_no_weight_another_gravity_or_wind():
