@@ -4,9 +4,9 @@ import importlib
 
 _HOMES = {
     "animate": "runtime.inference",
-    "crowd": "runtime.models",
+    "crowd": "runtime.loading",
     "initial_state": "runtime.inference",
-    "load": "runtime.models",
+    "load": "runtime.loading",
     "load_motion": "files.storage",
     "Material": "types",
     "Model": "runtime.models",

@@ -22,7 +22,7 @@ from clothjax.evaluation.rollouts import load_run
 from clothjax.export.onnx import run_onnx, to_onnx
 from clothjax.files import configuration
 from clothjax.render.gltf import to_glb
-from clothjax.runtime import inference, models, specialise
+from clothjax.runtime import inference, loading, specialise
 from clothjax.simulation import assembly
 from clothjax.training.pipeline import run_directory, train
 from clothjax.types import Motion
@@ -48,7 +48,7 @@ def main(argv: list[str]) -> None:
     betas = assembly.betas(config)
 
     print("exporting and drawing")
-    model = models.load(directory, betas=betas)
+    model = loading.load(directory, betas=betas)
     clip = assembly.motion(experiment, motion)
     origin = clip.translation[0]
     part = Motion(clip.rotations[:ONNX_FRAMES], (clip.translation[:ONNX_FRAMES] - origin).astype(np.float32), clip.fps)

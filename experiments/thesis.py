@@ -32,7 +32,7 @@ from clothjax.evaluation.report import evaluate
 from clothjax.evaluation.rollouts import Tracks, load_run
 from clothjax.files import checkpoint, configuration, storage
 from clothjax.render import ray_cast
-from clothjax.runtime import inference, models, trained
+from clothjax.runtime import inference, loading, trained
 from clothjax.runtime.models import Bounds, Model
 from clothjax.simulation import assembly
 from clothjax.training.pipeline import train
@@ -220,7 +220,7 @@ def failure(runs: Runs) -> tuple[dict, Section]:
         return {}, (title, "<p>Needs a run of ours.</p>")
     run = runs[garment]["ours"]
     experiment, _ = load_run(run)
-    model = models.load(run, betas=assembly.betas(experiment.config))
+    model = loading.load(run, betas=assembly.betas(experiment.config))
     everywhere = Bounds(*(jnp.full_like(model.network.first, x) for x in (-1e9, 1e9, 0.0)))
     free = dataclasses.replace(model, network=model.network._replace(code_bounds=everywhere))
     motion = experiment.config.evaluation.motions[0]

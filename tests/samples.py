@@ -23,7 +23,7 @@ from clothjax.networks import decoder, forces, mlp, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers, Scale
 from clothjax.physics import energies
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.runtime import inference, models
+from clothjax.runtime import inference, loading
 from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes
 from clothjax.types import Body, Contact, EdgeContact, Garment, Material, Motion, SelfContact
@@ -324,7 +324,7 @@ def random_model(skip, excluded=()):
         return Scale(*(jnp.asarray(row, jnp.float32) for row in rows))
 
     normalizers = Normalizers(scale(LATENT, -20, 1.0), scale(count, -1e3, 0.5))
-    return models.build(
+    return loading.build(
         config,
         experiment.garment,
         experiment.body,
@@ -347,7 +347,7 @@ class ForcePsi(NamedTuple):
     def model(self, **character):
         """Return the model of a character."""
         it = self.experiment
-        return models.build(
+        return loading.build(
             it.config, it.garment, it.body, it.names, self.garment, self.predictor, self.scales, **character
         )
 

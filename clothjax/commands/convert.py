@@ -25,7 +25,7 @@ from clothjax import cli
 from clothjax.export import formats
 from clothjax.export.formats import FORMATS, Options
 from clothjax.files import storage
-from clothjax.runtime import models, trained
+from clothjax.runtime import loading, trained
 from clothjax.runtime.models import Model
 from clothjax.simulation import assembly
 from clothjax.types import Material, Motion
@@ -61,7 +61,7 @@ def main(argv: list[str]) -> None:
             raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
         betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
     material = None if arguments.material is None else Material(*arguments.material)
-    model = models.load(run, betas=betas, material=material)
+    model = loading.load(run, betas=betas, material=material)
     form = FORMATS[arguments.to]
     shipped = arguments.model in trained.shipped()
     out = arguments.out or (Path(".") if shipped else run) / f"{model.config.garment}.{form.suffix}"

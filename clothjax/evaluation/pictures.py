@@ -15,7 +15,7 @@ from clothjax.progress import progress_bar
 from clothjax.render import gltf, point_cache, ray_cast, usd
 from clothjax.render.performance import Part, Performance
 from clothjax.render.ray_cast import CLOTH, SKIN, Surface
-from clothjax.runtime import models
+from clothjax.runtime import loading
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.types import Motion, Pose
@@ -56,7 +56,7 @@ def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[n
                 character = assembly.dress(experiment, betas, material)
                 tracks = {
                     "Phi": np.asarray(play(phi, character, poses)),
-                    "Psi": psi_trajectory(models.load(run, betas=betas, material=material), clip),
+                    "Psi": psi_trajectory(loading.load(run, betas=betas, material=material), clip),
                     "solver": reference.simulate(experiment.scene, character, poses, config)[0],
                 }
                 body, root = body_trajectory(experiment, clip, betas)
@@ -77,7 +77,7 @@ SIZE = (360, 480)
 def perform(run: Path, experiment: Experiment, motion: str, frames: int) -> Performance:
     """Roll Psi out over at most `frames` frames of a clip; return the garment, on the body if the scene has one."""
     clip = assembly.motion(experiment, motion)
-    garment = psi_trajectory(models.load(run, betas=assembly.betas(experiment.config)), clip)[:frames]
+    garment = psi_trajectory(loading.load(run, betas=assembly.betas(experiment.config)), clip)[:frames]
     body, root = body_trajectory(experiment, clip)
     parts = (
         Part("body", body[:frames], np.asarray(experiment.body.faces), SKIN),

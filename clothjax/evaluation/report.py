@@ -26,7 +26,7 @@ from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
 from clothjax.physics.energies import GRAVITY
 from clothjax.progress import progress_bar
-from clothjax.runtime import models, trained
+from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
@@ -141,7 +141,7 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
         return lambda: np.asarray(compiled(model, character, poses))
 
     def psi(character: Character, clip: Motion):
-        loaded = models.load(run, betas=np.asarray(character.betas), material=character.material)
+        loaded = loading.load(run, betas=np.asarray(character.betas), material=character.material)
         psi_trajectory(loaded, clip)  # compiles
         return lambda: psi_trajectory(loaded, clip)
 
@@ -231,7 +231,7 @@ def _pushed(experiment: Experiment, run: Path, character: Character, clip: Motio
     clip = Motion(clip.rotations[:frames], clip.translation[:frames], clip.fps)
     poses = windows(clip)
     count = poses.translation.shape[0]
-    psi = models.load(run, betas=np.asarray(character.betas), material=character.material)
+    psi = loading.load(run, betas=np.asarray(character.betas), material=character.material)
     result = {}
     for name, (acceleration, lasting) in PUSHES.items():
         external = np.zeros((count, 3), np.float32)

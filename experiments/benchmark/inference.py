@@ -19,7 +19,7 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import configuration, storage
 from clothjax.networks import decoder, psi
 from clothjax.networks.normalisation import Normalizers, Scale
-from clothjax.runtime import inference, models, specialise
+from clothjax.runtime import inference, loading, specialise
 from clothjax.runtime.models import Model
 from clothjax.simulation import assembly
 from clothjax.types import Motion, Pose
@@ -71,7 +71,7 @@ def paper_model() -> Model:
         return Scale(jnp.zeros(size), jnp.ones(size), jnp.full(size, -8.0), jnp.full(size, 8.0))
 
     normalizers = Normalizers(scale(size), scale(count))
-    return models.build(config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers)
+    return loading.build(config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers)
 
 
 def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
@@ -120,9 +120,9 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
 
 def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     """Measure variants of a garment of the library: time, bytes, and distance in a rollout to the unspecialised one."""
-    config = models.load(SHIPPED).config
+    config = loading.load(SHIPPED).config
     betas = assembly.betas(config)
-    model = models.load(SHIPPED, betas=betas)
+    model = loading.load(SHIPPED, betas=betas)
     clip = assembly.there_and_back(storage.load_motion("walk_3", model.names), frames)
     motion = Motion(clip.rotations, (clip.translation - clip.translation[:1]).astype(np.float32), clip.fps)
     reference = np.asarray(inference.animate(model, motion)[0])
@@ -191,7 +191,7 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
 
 def _resting() -> dict:
     """Measure the time saved on a character that stops and is skipped once `resting` is true, and the error."""
-    model = specialise.specialise(models.load(SHIPPED))
+    model = specialise.specialise(loading.load(SHIPPED))
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
     poses += poses[-1:] * STILL
@@ -209,10 +209,10 @@ def _resting() -> dict:
 
 def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
     """Measure microseconds a character in crowds in jax, each character with its own body."""
-    wearers = [specialise.specialise(models.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
+    wearers = [specialise.specialise(loading.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
     calls = {}
     for count in crowds:
-        crowd = models.crowd([wearers[i % len(wearers)] for i in range(count)])
+        crowd = loading.crowd([wearers[i % len(wearers)] for i in range(count)])
         pose = _pose(wearers[0])
         states = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), inference.initial_state(wearers[0], pose))
         poses = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), pose)

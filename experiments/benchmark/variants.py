@@ -20,7 +20,7 @@ from clothjax.files import storage
 from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
 from clothjax.networks.baselines import inputs as baseline_inputs
-from clothjax.runtime import models, specialise, trained
+from clothjax.runtime import loading, specialise, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
@@ -122,7 +122,7 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
     pose, like in C.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
-    model = models.load(run, betas=np.asarray(case.character.betas))
+    model = loading.load(run, betas=np.asarray(case.character.betas))
     count = len(model.network.shapes)
     forms = {family: specialise.specialise(model)}
     forms |= {

@@ -17,7 +17,7 @@ from clothjax.geometry import topology
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.physics import solver
-from clothjax.runtime import inference, models, specialise, trained
+from clothjax.runtime import inference, loading, specialise, trained
 from clothjax.simulation import assembly, characters, reference, rollout
 from clothjax.types import Material, Pose
 
@@ -39,12 +39,12 @@ class Outfit:
     """
 
     def __init__(self, run: Path, betas: np.ndarray, material: Material | None, count: int = 1, fine: bool = False):
-        model = models.load(run, betas=betas, material=material)
+        model = loading.load(run, betas=betas, material=material)
         if fine and (garment := finer(model.config)):
             body = storage.load_body(model.config.body)
             model = specialise.on_mesh(model, storage.load_garment(garment, body), betas)
         self.model, self.count = model, count
-        self._crowd = models.crowd([model] * count)
+        self._crowd = loading.crowd([model] * count)
         self._states = None
         self._run, self._betas, self._material = run, betas, material
         self._beside: dict[str, tuple] = {}

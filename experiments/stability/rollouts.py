@@ -14,7 +14,7 @@ from clothjax.evaluation import metrics
 from clothjax.evaluation.rollouts import load_run, phi_trajectory, windows
 from clothjax.material import configured_material
 from clothjax.physics import incremental_potential
-from clothjax.runtime import inference, models
+from clothjax.runtime import inference, loading
 from clothjax.runtime.models import Model
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
@@ -77,7 +77,7 @@ def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> di
     experiment, phi = load_run(run)
     config = experiment.config
     betas, cloth = assembly.betas(config), configured_material(config)
-    load = partial(models.load, run)
+    load = partial(loading.load, run)
     dress = partial(assembly.dress, experiment)
     usual, character = load(betas=betas), dress(betas, cloth)
     clip = assembly.motion(experiment, config.evaluation.motions[0])

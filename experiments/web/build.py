@@ -21,7 +21,7 @@ from clothjax.export import onnx
 from clothjax.files import storage
 from clothjax.progress import progress_bar
 from clothjax.render import ray_cast
-from clothjax.runtime import models, specialise, trained
+from clothjax.runtime import loading, specialise, trained
 from clothjax.types import Body
 
 HERE = Path(__file__).parent
@@ -41,7 +41,7 @@ def main(argv: list[str]) -> None:
     for folder in ("garments", "motions"):
         (arguments.out / folder).mkdir(parents=True, exist_ok=True)
     names = arguments.model or trained.shipped()
-    garments = {Path(name).resolve().name: models.load(trained.find(name)) for name in names}
+    garments = {Path(name).resolve().name: loading.load(trained.find(name)) for name in names}
     if len(garments) < len(names):
         raise ValueError(f"two models have one name: {', '.join(names)}; rename one")
     first, *others = garments.values()

@@ -6,14 +6,14 @@ from samples import random_force_psi
 
 from clothjax.evaluation import metrics, report
 from clothjax.material import configured_material
-from clothjax.runtime import models
+from clothjax.runtime import loading
 from clothjax.simulation import assembly
 
 
 def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     """The solver is asked of steps that the acceleration acts in, on the garment that it acted on."""
     forced = random_force_psi()
-    monkeypatch.setattr(models, "load", lambda run, **character: forced.model(**character))
+    monkeypatch.setattr(loading, "load", lambda run, **character: forced.model(**character))
     asked = []
 
     def step_measures(scene, character, track, poses, frames, config, external):

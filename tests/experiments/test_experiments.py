@@ -14,7 +14,7 @@ from clothjax.evaluation import metrics, pictures, rollouts
 from clothjax.evaluation import report as measures
 from clothjax.files import checkpoint
 from clothjax.networks import normalisation
-from clothjax.runtime import models, trained
+from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
 from clothjax.training import pipeline
 from clothjax.types import Motion
@@ -123,7 +123,7 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
         assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
     experiment = assembly.assemble(config)
     clip = assembly.motion(experiment, "walk_3")
-    one, other = (rollouts.psi_trajectory(models.load(which), clip)[:20] for which in (finished, "toy"))
+    one, other = (rollouts.psi_trajectory(loading.load(which), clip)[:20] for which in (finished, "toy"))
     assert 0 < metrics.distance_mm(one, other).max() < 1.0
     with pytest.raises(ValueError, match=r"coat: no such folder, and no garment called so .* or a name: toy"):
         render.main(["coat", "--out", "x.png"])
@@ -131,7 +131,7 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
     for damaged in (whole_file[: size // 2], b"", whole_file[: size // 2] + b"?" + whole_file[size // 2 + 1 :]):
         (tmp_path / "toy" / "model.npz").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"model\.npz: not a whole packed model"):
-            models.load("toy")
+            loading.load("toy")
 
 
 def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_refused(finished, tmp_path):
@@ -169,7 +169,7 @@ def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
     assert (other[3].pose.low <= one[3].pose.low).all() and (other[3].pose.high >= one[3].pose.high).all()
     assert (other[3].pose.low < one[3].pose.low).any() and (other[3].pose.high > one[3].pose.high).any()
     clip = assembly.motion(assembly.assemble(config), "dance_3")
-    assert np.isfinite(rollouts.psi_trajectory(models.load(tmp_path / "out"), clip)).all()
+    assert np.isfinite(rollouts.psi_trajectory(loading.load(tmp_path / "out"), clip)).all()
     with pytest.raises(ValueError, match="coat: no such folder"):
         tune.main(["coat", "--out", str(tmp_path / "out")])
     with pytest.raises(ValueError, match=r"tuning\.steps is 0"):

@@ -21,7 +21,7 @@ from toy import small
 
 from clothjax.cli import fail_clearly
 from clothjax.files import checkpoint, configuration, storage
-from clothjax.runtime import models, trained
+from clothjax.runtime import loading, trained
 from clothjax.training import run_folder
 from data_prep import amass, asf_amc, bvh, garment, smpl
 from experiments import convert, evaluate, gallery, quickstart, render, sweep, thesis, train, tune
@@ -483,13 +483,13 @@ def begun(folder: Path) -> Path:
 @case("model.npz", "not a whole packed model", "install clothjax again")
 def a_model_cut_short(folder):
     run = packed(folder, lambda path: path.write_bytes(path.read_bytes()[:90000]))
-    return lambda: models.load(run)
+    return lambda: loading.load(run)
 
 
 @case("model.npz")
 def a_model_that_would_run_something(folder):
     run = packed(folder, lambda path: np.savez(path, predictor=np.array([Hostile()], dtype=object)))
-    return lambda: models.load(run)
+    return lambda: loading.load(run)
 
 
 @case("coat", "skirt")
@@ -553,7 +553,7 @@ def a_folder_that_is_a_file(folder):
 
 @case("betas have shape", r"\(10,\)")
 def betas_of_another_body(folder):
-    return lambda: models.load("skirt", betas=np.zeros(3))
+    return lambda: loading.load("skirt", betas=np.zeros(3))
 
 
 @case("--betas", "10")

@@ -11,7 +11,7 @@ from clothjax.evaluation import rollouts
 from clothjax.material import configured_material
 from clothjax.networks import animators, normalisation
 from clothjax.physics.energies import GRAVITY
-from clothjax.runtime import inference, models, specialise, trained
+from clothjax.runtime import inference, loading, specialise, trained
 from clothjax.simulation import assembly, characters, rollout
 from clothjax.types import ClothState, Material, Motion, Pose
 
@@ -127,7 +127,7 @@ def test_a_crowd_is_each_of_its_characters(forced, motion):
     each = [inference.initial_state(model, jax.tree.map(lambda x, i=i: x[i], poses)) for i, model in enumerate(wearers)]
     states = jax.tree.map(lambda *x: jnp.stack(x), *each)
     external = jnp.array([[0.0, 0.0, 0.0], [30.0, 0.0, -10.0]])
-    _, together = inference.step_crowd(models.crowd(wearers), states, poses, external)
+    _, together = inference.step_crowd(loading.crowd(wearers), states, poses, external)
     for i, model in enumerate(wearers):
         mine = jax.tree.map(lambda x, i=i: x[i], poses)
         _, alone = inference.step(model, each[i], mine, external=external[i])

@@ -8,7 +8,7 @@ from toy import small
 
 from clothjax.files import storage
 from clothjax.networks import normalisation, psi
-from clothjax.runtime import inference, models, specialise
+from clothjax.runtime import inference, loading, models, specialise
 from clothjax.simulation import assembly
 from clothjax.training import stage1, stage2
 from clothjax.types import Material, Motion, Pose
@@ -31,7 +31,7 @@ def trained():
     ))  # fmt: skip
 
     def wearer(betas, material=None):
-        return models.build(
+        return loading.build(
             config, experiment.garment, experiment.body, experiment.names, second.garment, second.params, wide,
             betas=betas, material=material,
         )  # fmt: skip
@@ -66,7 +66,7 @@ def test_step_is_compiled_once_for_every_character(trained):
 def test_a_crowd_is_each_of_its_characters(trained):
     _, motion, _, wearer = trained
     wearers = [wearer(np.full(10, 0.5 * i), Material(0.2 + 0.1 * i, 2e4, 4e4, 1e-5)) for i in range(4)]
-    crowd = models.crowd(wearers)
+    crowd = loading.crowd(wearers)
     pose = Pose(jnp.asarray(motion.rotations[:4]), jnp.asarray(motion.translation[:4]))
     states = jax.tree.map(lambda *x: jnp.stack(x), *(
         inference.initial_state(model, Pose(pose.rotations[i], pose.translation[i])) for i, model in enumerate(wearers)
@@ -84,12 +84,12 @@ def test_a_crowd_is_of_one_garment(trained):
     other = wearer(np.ones(10))
     changed = other.network._replace(shapes=2 * other.network.shapes)
     with pytest.raises(ValueError, match=r"models\[1\] differs from models\[0\] in more than its wearer"):
-        models.crowd([model, dataclasses.replace(other, network=changed)])
+        loading.crowd([model, dataclasses.replace(other, network=changed)])
     fewer = [specialise.specialise(each, blendshapes=4) for each in (model, other)]
     with pytest.raises(ValueError, match="whose blend shapes `specialise` has not fitted"):
-        models.crowd(fewer)
+        loading.crowd(fewer)
     with pytest.raises(ValueError, match="at least one"):
-        models.crowd([])
+        loading.crowd([])
 
 
 def test_a_motion_of_another_rate_or_skeleton_is_refused(trained):
@@ -112,7 +112,7 @@ def test_a_garment_that_nobody_sees_goes_on(trained):
 
 @pytest.mark.parametrize("name", ["dress", "pants", "skirt", "tshirt"])
 def test_a_garment_at_rest_can_be_left_alone(name):
-    model = models.load(name)
+    model = loading.load(name)
     clip = storage.load_motion("walk_3", model.names)
     poses = [Pose(jnp.asarray(clip.rotations[t]), jnp.asarray(clip.translation[t], jnp.float32)) for t in range(20)]
     state = inference.initial_state(model, poses[0])

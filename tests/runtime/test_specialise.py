@@ -12,7 +12,7 @@ import clothjax as cj
 from clothjax.body import skinning
 from clothjax.export import native
 from clothjax.files import storage
-from clothjax.runtime import inference, models, specialise
+from clothjax.runtime import inference, loading, models, specialise
 from clothjax.simulation import assembly
 from clothjax.types import Motion
 
@@ -154,7 +154,7 @@ def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
 
 def test_fewer_shapes_bear_eight_bits():
     """Their coordinates do not cancel each other: rounding them does not hurt more than leaving shapes out."""
-    model = models.load("skirt")
+    model = loading.load("skirt")
     clip = storage.load_motion("walk_3", model.names)
     motion = Motion(clip.rotations[:60], clip.translation[:60].astype(np.float32), clip.fps)
     for count in (192, 64):

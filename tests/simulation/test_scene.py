@@ -15,7 +15,7 @@ from clothjax.export.onnx import run_onnx, to_onnx
 from clothjax.files import storage
 from clothjax.networks import animators
 from clothjax.physics import incremental_potential
-from clothjax.runtime import inference, models
+from clothjax.runtime import inference, loading
 from clothjax.simulation import assembly, characters, reference, rollout, time_step
 from clothjax.simulation.scene import build_scene
 from clothjax.training import laplacian_shapes, pipeline, stage1
@@ -279,7 +279,7 @@ def test_a_flag_goes_all_the_way(tmp_path):
     assert report["psi"]["finite"] and "penetration_percent" not in report["psi"]
     render.main([str(tmp_path), "--motions", "walk_3", "--out", str(tmp_path / "flag.webp"), "--frames", "3"])
     render.main([str(tmp_path), "--motions", "walk_3", "--out", str(tmp_path / "flag.glb"), "--frames", "3"])
-    model = models.load(tmp_path)
+    model = loading.load(tmp_path)
     clip = storage.load_motion("walk_3", assembly.assemble(config).names)
     clip = Motion(clip.rotations[:20], clip.translation[:20].astype(np.float32), clip.fps)
     vertices, _ = inference.animate(model, clip)

@@ -13,7 +13,7 @@ from clothjax.body import motion_clips
 from clothjax.config import Config, LossConfig, Ramp, TuningConfig
 from clothjax.networks import animators, normalisation
 from clothjax.networks.normalisation import Normalizers, Scale
-from clothjax.runtime import inference, models
+from clothjax.runtime import inference, loading
 from clothjax.simulation import assembly, characters
 from clothjax.simulation.rollout import StepInput
 from clothjax.training import fine_tuning, stage1
@@ -32,7 +32,7 @@ def toy():
 def test_psi_in_training_is_psi_in_use(toy):
     experiment, _, kept, garment, predictor, normalizers = toy
     config, betas = experiment.config, jnp.linspace(-1, 1, 10)
-    model = models.build(
+    model = loading.build(
         config, experiment.garment, experiment.body, experiment.names, garment, predictor, normalizers, betas=betas
     )
     clip = assembly.motion(experiment, "walk_0")

@@ -15,7 +15,7 @@ from clothjax.evaluation import report
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
-from clothjax.runtime import models, trained
+from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
 from clothjax.training import candidates, imitation, labels, pipeline, pool, sampling, stage1
 from clothjax.training.labels import Round
@@ -360,6 +360,6 @@ def test_a_run_with_forces_is_tuned_and_measured_but_not_yet_used_elsewhere(toy,
     measured = report.evaluate(tmp_path)["evaluation"]["psi"]
     assert np.isfinite(measured["energy_gap"]) and measured["swing_ratio"] > 0
     with pytest.raises(ValueError, match="does not run outside training yet"):
-        models.load(tmp_path)
+        loading.load(tmp_path)
     with pytest.raises(ValueError, match="cannot be packed yet"):
         trained.pack(tmp_path, tmp_path / "packed")

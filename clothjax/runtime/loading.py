@@ -1,0 +1,218 @@
+"""Models built from what training left: loaded, of one character or of a crowd."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.body import reach, skinning
+from clothjax.config import Config
+from clothjax.files import storage
+from clothjax.geometry import topology
+from clothjax.networks import normalisation, psi
+from clothjax.networks.normalisation import ForceScales, Normalizers
+from clothjax.physics import elastic_forces, energies
+from clothjax.runtime import trained
+from clothjax.runtime.models import (
+    Bounds,
+    Cloth,
+    ForcePredictor,
+    Layer,
+    Model,
+    Network,
+    PosePredictor,
+    Wearer,
+)
+from clothjax.types import Array, Body, Garment, Material, Mesh
+
+FORCE_SLACK = 0.0125  # of the range of a code of a Psi with forces, a tenth of a deviation: how far out is still inside
+
+
+def build(
+    config: Config,
+    garment: Garment,
+    body: Body,
+    names: tuple[str, ...],
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers | ForceScales,
+    *,
+    betas: Array | None = None,
+    material: Material | None = None,
+) -> Model:
+    """Build the model of one character from what training gave.
+
+    Scales and constants of the inputs are folded into the layers that read them.
+
+    Args:
+        garment, body, names: as loaded by `storage`; names [J] of the joints.
+        garment_params: parameters of the decoder with its blend shapes.
+        predictor: parameters of the latent predictor.
+        normalizers: scales of its codes and inputs.
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: for betas of another shape than the body's.
+    """
+    betas = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
+    if betas.shape != (body.shapedirs.shape[-1],):
+        raise ValueError(f"betas have shape {betas.shape}; this body takes ({body.shapedirs.shape[-1]},)")
+    cloth = config.material
+    constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
+    material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
+    touched = mesh = around = None
+    if isinstance(normalizers, ForceScales):
+        touched, candidates = _touched(garment, body, normalizers.candidates, config)
+        normalizers = normalizers._replace(candidates=candidates)
+        mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
+        around = elastic_forces.around(mesh, len(garment.vertices))
+    network, wearer = _arrays(
+        garment, body, touched, mesh, around, garment_params, predictor, normalizers, betas, material, config
+    )
+    return Model(
+        network=network,
+        wearer=wearer,
+        faces=jnp.asarray(garment.faces),
+        names=tuple(names),
+        parents=tuple(int(p) for p in body.parents),
+        input_joints=tuple(int(joint) for joint in psi.input_joints(names, config.stage2)),
+        moving=tuple(range(len(names))),
+        config=config,
+    )
+
+
+def _touched(garment: Garment, body: Body, candidates: Array, config: Config) -> tuple[Body, np.ndarray]:
+    """Return the part of a body that candidates are of, and the candidates [V, K] int32 numbered among its faces."""
+    within = reach.reachable(body, garment, config.physics.reach)
+    used, numbered = np.unique(np.asarray(candidates), return_inverse=True)
+    faces = np.asarray(within.faces)[used]
+    vertices, renumbered = np.unique(faces, return_inverse=True)
+    touched = reach.part(within, vertices, renumbered.reshape(faces.shape).astype(np.int32))
+    return touched, numbered.reshape(np.shape(candidates)).astype(np.int32)
+
+
+@partial(jax.jit, static_argnames="config")
+def _arrays(
+    garment: Garment,
+    body: Body,
+    touched: Body | None,
+    mesh: Mesh | None,
+    around: Array | None,
+    garment_params: dict,
+    predictor: dict,
+    normalizers: Normalizers | ForceScales,
+    betas: Array,
+    material: Material,
+    config: Config,
+) -> tuple[Network, Wearer]:
+    """Build the arrays of a model in one compiled program, which starts faster than many small ones.
+
+    Args:
+        touched: the part of the body that is felt, and ...
+        mesh, around: ... the elements that feel; None without forces.
+    """
+    given = psi.constant_inputs(betas, material, config.material)
+    constants, known = psi.bounded_constants(given, config)
+    template = skinning.shaped_vertices(garment, betas)
+    bias, cloth, latent = jnp.zeros(0), None, None
+    if isinstance(normalizers, ForceScales):
+        assert touched is not None and mesh is not None and around is not None
+        rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
+        shaped = skinning.shaped_vertices(touched, betas)
+        cloth = Cloth(constants, areas * material.density, rest, material, shaped, None)
+        corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
+        weights = jnp.asarray(touched.weights).T
+        parts = ForcePredictor(predictor, normalizers, mesh, around, touched.faces, weights, corrections, None)
+        bounds = Bounds(normalizers.low, normalizers.high, FORCE_SLACK * (normalizers.high - normalizers.low))
+        first = jnp.zeros(len(normalizers.low))
+    else:
+        latent, pose = normalizers
+        size = len(latent.mean)
+        layer, *hidden = _layers(predictor)
+        of_code, of_pose, of_constants = jnp.split(layer.kernel, [size, size + len(pose.mean)])
+        bias = constants @ of_constants
+        ranges = pose.low * pose.deviation, pose.high * pose.deviation, jnp.full(len(pose.mean), normalisation.SLACK)
+        parts = PosePredictor(
+            of_pose / pose.deviation[:, None], pose.mean, Bounds(*ranges), Layer(of_code, layer.bias), tuple(hidden)
+        )
+        bounds = Bounds(latent.low, latent.high, jnp.full(size, normalisation.CODE_SLACK))
+        first = -latent.mean / latent.deviation
+    read, *decoder = _layers(garment_params["decoder"])
+    if config.model.decoder_skip:
+        skip = jnp.asarray(garment_params["skip"])
+        read = Layer(jnp.concatenate([read.kernel, skip], axis=1), jnp.pad(read.bias, (0, skip.shape[1])))
+    if latent is not None:
+        read = Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel)
+    shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
+    network = Network(
+        predictor=parts,
+        code_bounds=bounds,
+        first=first,
+        read=read,
+        decoder=tuple(decoder),
+        mix=None,
+        shapes=jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1),
+        weights=jnp.asarray(garment.weights).T,
+    )
+    return network, Wearer(bias, template.T, skinning.shaped_joints(body, betas), known, cloth)
+
+
+def _layers(mlp: dict) -> list[Layer]:
+    layers = (mlp[f"dense_{i}"] for i in range(len(mlp)))
+    return [Layer(jnp.asarray(layer["kernel"]), jnp.asarray(layer["bias"])) for layer in layers]
+
+
+def crowd(models: Sequence[Model]) -> Model:
+    """Build one model of many characters in the same garment, for `step_crowd`.
+
+    Args:
+        models: of different characters, otherwise the same.
+
+    Raises:
+        ValueError: if there is none, or one differs from the first in more than its character.
+    """
+    if not models:
+        raise ValueError("a crowd needs at least one model")
+    first, *others = (jax.tree.flatten(dataclasses.replace(model, wearer=models[0].wearer)) for model in models)
+    for number, (leaves, structure) in enumerate(others, 1):
+        same = structure == first[1] and all(
+            a is b or np.array_equal(a, b) for a, b in zip(leaves, first[0], strict=True)
+        )
+        if not same:
+            raise ValueError(
+                f"models[{number}] differs from models[0] in more than its wearer: a crowd is of one garment, and of "
+                "models whose blend shapes `specialise` has not fitted to their characters"
+            )
+    wearers = jax.tree.map(lambda *each: jnp.stack(each), *(model.wearer for model in models))
+    return dataclasses.replace(models[0], wearer=wearers)
+
+
+def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
+    """Load the model of a finished run, or of a garment that comes with the library.
+
+    Args:
+        run: the folder of a run or of a packed model, or a name from `trained.shipped()`, such as "skirt".
+        betas: [S] body shape; default the mean body.
+        material: default the configured one.
+
+    Raises:
+        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
+    """
+    run_psi = trained.psi(trained.find(run))
+    body, names = storage.load_rig(run_psi.config.body)
+    return build(
+        run_psi.config,
+        storage.load_garment(run_psi.config.garment, body),
+        body,
+        names,
+        run_psi.garment,
+        run_psi.predictor,
+        run_psi.normalizers,
+        betas=betas,
+        material=material,
+    )
