@@ -18,6 +18,7 @@ from clothjax import cli
 from clothjax.config import Config
 from clothjax.files import configuration
 from clothjax.networks import normalisation, psi
+from clothjax.networks.normalisation import Normalizers
 from clothjax.runtime import trained
 from clothjax.simulation import assembly
 from clothjax.training import pipeline, stage2
@@ -38,9 +39,11 @@ def main(argv: list[str]) -> None:
     source = trained.psi(folder)
     experiment = assembly.assemble(config)
     clips, _ = assembly.training_clips(experiment)
-    input_joints = psi.input_joints(experiment.names, config.stage2)
-    seen = stage2.ordinary_poses(experiment.scene, clips, input_joints, config)
-    normalizers = source.normalizers._replace(pose=normalisation.widened(source.normalizers.pose, seen))
+    normalizers = source.normalizers
+    if isinstance(normalizers, Normalizers):  # a Psi with forces does not read the pose
+        input_joints = psi.input_joints(experiment.names, config.stage2)
+        seen = stage2.ordinary_poses(experiment.scene, clips, input_joints, config)
+        normalizers = normalizers._replace(pose=normalisation.widened(normalizers.pose, seen))
     run = pipeline.Run(experiment, arguments.out, clips, None)
     tuned = pipeline.fine_tune(run, phi["params"], pipeline.Psi(source.garment, source.predictor, normalizers))
     size = trained.write(arguments.out, config, phi, jax.device_get(tuned.state.average), normalizers)
