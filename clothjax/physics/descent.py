@@ -31,14 +31,16 @@ def _step(
 ) -> _Iterate:
     """Take one step of `descend`."""
     x, pullback = jax.vjp(garment, last.latent)
-    (energy, force), hessian = jax.linearize(jax.value_and_grad(potential), x)
+    energy, force = jax.value_and_grad(potential)(x)
     new = pullback(force)[0]
     down = -precondition(new)
     beta = jnp.sum(new * (last.steepest - down)) / jnp.maximum(-jnp.sum(last.gradient * last.steepest), 1e-12)
     direction = down + jnp.maximum(beta, 0.0) * last.direction
     direction = jnp.where(jnp.sum(new * direction) < 0, direction, down)
     _, moved = jax.jvp(garment, (last.latent,), (direction,))
-    slope, curvature = jnp.maximum(-jnp.sum(moved * force), 0.0), jnp.sum(moved * hessian(moved)[1])
+    # forwards twice: the product with the Hessian takes twice as long
+    _, curvature = jax.jvp(lambda y: jax.jvp(potential, (y,), (moved,))[1], (x,), (moved,))
+    slope = jnp.maximum(-jnp.sum(moved * force), 0.0)
     convex = curvature > 0
     length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
     push = jnp.where(slope > 0, length, 0.0) * direction

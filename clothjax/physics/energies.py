@@ -5,11 +5,14 @@ force (its gradient) and the reference solver's Hessian (second derivative, elem
 finite, with a finite gradient, at zero edges, zero areas, flat and folded hinges and zero slip.
 """
 
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from clothjax.geometry.vectors import norm
+from clothjax.geometry import vectors
+from clothjax.geometry.vectors import cross, dot, minus, norm, plus, times
 from clothjax.types import Array, Garment, Mesh, Rest, Scalar
 
 GRAVITY = 9.81  # m/s^2
@@ -89,10 +92,17 @@ def cloth_measures(
 
 def green_strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> Float[Array, "F 2 2"]:
     """Green strain [F, 2, 2] of deformed triangles [F, 3, 3] m with inverse rest edge matrices [F, 2, 2] 1/m."""
-    edges = jnp.stack([corners[:, 0] - corners[:, 2], corners[:, 1] - corners[:, 2]], axis=-1)
-    gradient = jnp.einsum("fab,fbc->fac", edges, inverse)
-    metric = jnp.einsum("fab,fac->fbc", gradient, gradient)
-    return 0.5 * (metric - jnp.eye(2, dtype=corners.dtype)[None])
+    along, shear, across = _strain(corners, inverse)
+    return jnp.stack([jnp.stack([along, shear], axis=1), jnp.stack([shear, across], axis=1)], axis=1)
+
+
+def _strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> tuple[Array, Array, Array]:
+    """Return the entries 11, 12 and 22 [F] of the Green strain: (F^T F - I) / 2."""
+    a, b, c, d = inverse.reshape(-1, 4).T
+    first, second, third = vectors.corners(corners)
+    left, right = minus(first, third), minus(second, third)
+    along, across = plus(times(a, left), times(c, right)), plus(times(b, left), times(d, right))
+    return 0.5 * (dot(along, along) - 1.0), 0.5 * dot(along, across), 0.5 * (dot(across, across) - 1.0)
 
 
 def stretching(
@@ -104,25 +114,28 @@ def stretching(
     thickness: float = THICKNESS,
 ) -> Float[Array, " F"]:
     """Saint Venant-Kirchhoff energy [F] J: A h (mu tr(G^2) + lambda/2 tr(G)^2) of triangles [F, 3, 3] m."""
-    strain = green_strain(corners, inverse)
-    trace = strain[:, 0, 0] + strain[:, 1, 1]
-    return area * thickness * (mu * jnp.sum(strain * strain, axis=(1, 2)) + 0.5 * lam * trace * trace)
+    along, shear, across = _strain(corners, inverse)
+    trace = along + across
+    squares = along * along + 2.0 * shear * shear + across * across
+    return area * thickness * (mu * squares + 0.5 * lam * trace * trace)
 
 
 def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     """Signed angle [H] rad between the faces of hinges [H, 4, 3]; 0 if flat, or where a face has hardly any area."""
-    offsets = corners[:, 1:] - corners[:, :1]
+    start, *others = vectors.corners(corners)
+    offsets = [minus(other, start) for other in others]
     # the angle does not depend on size, but sine and cosine below are of fifth order in length and would underflow
-    size = jax.lax.stop_gradient(jnp.max(jnp.abs(offsets), axis=(1, 2), keepdims=True))
-    offsets = offsets / jnp.where(size > 0, size, 1.0)
-    edge = offsets[:, 0]
-    left = jnp.cross(edge, offsets[:, 1])
-    right = jnp.cross(offsets[:, 2], edge)
-    sine = jnp.sum(jnp.cross(left, right) * edge, axis=-1)
-    cosine = jnp.sum(left * right, axis=-1) * norm(edge)
+    sizes = [jnp.abs(component) for offset in offsets for component in offset]
+    size = jax.lax.stop_gradient(reduce(jnp.maximum, sizes))
+    edge, left, right = (times(1.0 / jnp.where(size > 0, size, 1.0), offset) for offset in offsets)
+    left, right = cross(edge, left), cross(right, edge)
+    squared = dot(edge, edge)
+    length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    sine = dot(cross(left, right), edge)
+    cosine = dot(left, right) * length
     # small again where faces are slivers, and arctan2's derivative squares them
     scale = jax.lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
-    area = jnp.minimum(jnp.sum(left * left, axis=-1), jnp.sum(right * right, axis=-1))
+    area = jnp.minimum(dot(left, left), dot(right, right))
     degenerate = (area < SLIVER * SLIVER) | (scale == 0)
     scale = jnp.where(degenerate, 1.0, scale)
     return jnp.where(degenerate, 0.0, jnp.arctan2(sine / scale, jnp.where(degenerate, 1.0, cosine / scale)))
@@ -135,9 +148,10 @@ def bending(
     stiffness: Scalar | Float[Array, " H"],
 ) -> Float[Array, " H"]:
     """Dihedral energy [H] J: k l^2 / (4 A) (theta - theta_0)^2 / 2, l the current edge, A the rest area."""
-    edge = corners[:, 1] - corners[:, 0]
+    start, end, *_ = vectors.corners(corners)
+    edge = minus(end, start)
     angle = dihedral_angle(corners) - rest_angle
-    return stiffness * jnp.sum(edge * edge, axis=-1) / (8.0 * area) * angle * angle
+    return stiffness * dot(edge, edge) / (8.0 * area) * angle * angle
 
 
 def gravity(height: Float[Array, "*n"], mass: Float[Array, "*n"]) -> Float[Array, "*n"]:

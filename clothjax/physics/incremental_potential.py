@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from clothjax.config import PhysicsConfig
+from clothjax.geometry.vectors import at_corners
 from clothjax.physics import contact_search
 from clothjax.physics.energies import bending, collision, friction, gravity, inertia, stretching
 from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, Scalar, SelfContact
@@ -66,9 +67,11 @@ def elements(
     contact = step.contact
     terms = {
         "stretching": laws.stretching(
-            new[mesh.faces], step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
+            at_corners(new, mesh.faces), step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
         ),
-        "bending": bending(new[mesh.hinges], step.rest.hinge_area, step.rest.hinge_angle, step.material.bending),
+        "bending": bending(
+            at_corners(new, mesh.hinges), step.rest.hinge_area, step.rest.hinge_angle, step.material.bending
+        ),
         # the height gained in the step: the same force as the height, without its large constant
         "gravity": gravity(moved[:, 1], step.mass),
         "inertia": inertia(moved - step.velocity, step.mass, step.timestep),
@@ -88,7 +91,7 @@ def elements(
             FRICTION_SMOOTHING,
         )
     if step.edge_contact is not None:
-        terms["edge_collision"] = edge_collision(new[mesh.edges], step.edge_contact, config, laws)
+        terms["edge_collision"] = edge_collision(at_corners(new, mesh.edges), step.edge_contact, config, laws)
     if step.self_contact is not None:
         points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
         terms["self_collision"] = self_collision(points, step.self_contact, config, laws)
