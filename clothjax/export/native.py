@@ -19,7 +19,8 @@ from clothjax.networks import psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
 from clothjax.physics.energies import GRAVITY, THICKNESS
-from clothjax.runtime.models import CAUSES, Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor, Shown
+from clothjax.runtime import drape
+from clothjax.runtime.models import CAUSES, Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor
 from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
@@ -104,7 +105,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         raise ValueError("plain C has no pose blend shapes of a body yet; export to another format")
     if 3 * len(cloth.mass) > MOST_WIDTH:
         raise ValueError(f"plain C takes {MOST_WIDTH // 3} vertices of a garment with forces, not {len(cloth.mass)}")
-    felt = predictor.felt or Shown(network.shapes, network.weights)
+    felt, template = drape.felt_garment(model)
     mesh, rest, scales = predictor.mesh, cloth.rest, predictor.scales
     vertices, neighbours = scales.candidates.shape
     yield np.array(
@@ -130,6 +131,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(cloth.body.T)
     if predictor.felt is not None:
         yield _padded(felt.weights)
+        yield _padded(predictor.felt.nearest)
     read, code = network.read, len(network.first)
     assert isinstance(read, Layer)
     inputs = len(scales.middle) - len(cloth.constants)
@@ -151,8 +153,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield from _layer(Layer(kernel[:inputs], bias))
     yield from _exact(np.asarray(scales.output) * back)
     if predictor.felt is not None:
-        assert cloth.template is not None
-        yield from _layer(Layer(felt.shapes, cloth.template.reshape(-1)), gains=True)
+        yield from _layer(Layer(felt.shapes, template.reshape(-1)), gains=True)
     assert inputs == (2 + len(KINDS)) * code
 
 

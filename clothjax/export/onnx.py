@@ -107,11 +107,12 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     transforms = g.slice(g.reshape(moving, len(model.moving), 16), 2, 0, 12)
     slack = np.asarray(network.code_bounds.slack)
     rows = advance = ""
+    planes = ("", "")
     if isinstance(predictor, ForcePredictor):
         stepped = g("Sub", g.slice(pose, 2, 9 * count, 9 * count + 3), g.slice(last, 2, 9 * count, 9 * count + 3))
         advance = g("Transpose", stepped, perm=[0, 2, 1])
         rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
-        code = onnx_forces.next_code(g, model, rows, transforms, advance)
+        code, planes = onnx_forces.next_code(g, model, rows, transforms, advance)
         low, high = (np.asarray(x) for x in network.code_bounds[:2])
         whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)
         latent, _ = g.within(whole, low, high, name="next_latent")
@@ -150,6 +151,8 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     if output == "world":
         if not isinstance(predictor, ForcePredictor) or predictor.felt is not None:
             skinned = g.skinned(garment, transforms, network.weights)
+        if isinstance(predictor, ForcePredictor):
+            skinned = onnx_forces.pushed_out(g, model, skinned, planes, advance)
         placed = g("Add", skinned, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
         placed = g.reshape(garment, 3, vertices)

@@ -12,6 +12,7 @@ from clothjax.export.onnx_graph import Graph
 from clothjax.networks import psi
 from clothjax.networks.forces import KINDS
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
+from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
 
 DRAPE = ("change", "garment", "position", "velocity")  # of the state, beside `latent` and `history`
@@ -37,8 +38,7 @@ def parts(model: Model) -> Parts:
     assert isinstance(predictor, ForcePredictor) and cloth is not None
     if predictor.corrections is not None:
         raise ValueError("ONNX has no pose blend shapes of a body yet; export to another format")
-    felt = predictor.felt or Shown(model.network.shapes, model.network.weights)
-    template = model.wearer.template if cloth.template is None else cloth.template
+    felt, template = drape.felt_garment(model)
     return Parts(predictor, cloth, felt, np.asarray(template))
 
 
@@ -61,8 +61,8 @@ def moved(g: Graph, rows: str, points: str) -> str:
     return g("Add", turned, g("Squeeze", g.slice(rows, 2, 3, 4), np.array([2], np.int64)))
 
 
-def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) -> str:
-    """Return the next code [N, L], not yet clipped.
+def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) -> tuple[str, tuple[str, str]]:
+    """Return the next code [N, L], not yet clipped, with points and normals [N, 3, V] of what the garment touches.
 
     Args:
         rows: transforms [N, 3, 4, V] of the garment that feels, at the next frame.
@@ -71,10 +71,11 @@ def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) 
     """
     it = parts(model)
     held = g("Add", moved(g, rows, "garment"), advance)
+    planes = _planes(g, it, held, transforms, advance)
     kinds = [
         _momentum(g, model, it, held),
         _elasticity(g, model, it, held),
-        _contact(g, model, it, held, transforms, advance),
+        _contact(g, model, held, *planes),
     ]
     on_vertices = g("Concat", *(g("Unsqueeze", kind, np.array([1], np.int64)) for kind in kinds), axis=1)
     turned = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
@@ -82,7 +83,7 @@ def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) 
     carried_back = g("ReduceSum", carried_back, np.array([2], np.int64), keepdims=0)  # [N, kinds, 3, V]
     flat = g.reshape(carried_back, len(KINDS), int(np.prod(it.template.shape)))
     pulls = _pulled_back(g, model, g("MatMul", flat, np.asarray(it.felt.shapes).T))
-    return _predicted(g, model, it, pulls)
+    return _predicted(g, model, it, pulls), planes
 
 
 def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance: str) -> str:
@@ -100,6 +101,24 @@ def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance
     position = g("Transpose", placed, perm=[0, 2, 1], name="next_position")
     g("Sub", g("Add", position, g("Transpose", advance, perm=[0, 2, 1])), "position", name="next_velocity")
     return placed
+
+
+def pushed_out(g: Graph, model: Model, shown: str, planes: tuple[str, str], advance: str) -> str:
+    """Return the vertices [N, 3, V'] m that are shown, pushed out of the body as by `drape.shown_outside`.
+
+    Args:
+        shown: [N, 3, V'] m, relative to the root's new place.
+        planes: of `next_code`.
+        advance: as of `next_code`.
+    """
+    felt = parts(model).predictor.felt
+    point, normal = planes
+    if felt is not None:
+        point, normal = (g("Gather", x, np.asarray(felt.nearest, np.int64), axis=2) for x in planes)
+    gap = _dot(g, g("Sub", g("Add", shown, advance), point), normal)
+    depth = g("Sub", np.float32(model.config.physics.collision_offset), gap)
+    depth = g("Min", g("Relu", depth), np.float32(drape.DEEPEST))
+    return g("Add", shown, g("Mul", depth, normal))
 
 
 def pushed(g: Graph) -> str:
@@ -181,9 +200,9 @@ def _bending(g: Graph, model: Model, it: Parts, held: str, hinges: np.ndarray) -
     return [g("Sub", at_start, longer), g("Add", at_end, longer), *tips]
 
 
-def _contact(g: Graph, model: Model, it: Parts, held: str, transforms: str, advance: str) -> str:
-    """Forces [N, 3, V] in N of the planes of the nearest candidates, as of `forces.felt`."""
-    predictor, cloth, physics = it.predictor, it.cloth, model.config.physics
+def _planes(g: Graph, it: Parts, held: str, transforms: str, advance: str) -> tuple[str, str]:
+    """Points and normals [N, 3, V] of the nearest candidates, as of `forces.felt`."""
+    predictor, cloth = it.predictor, it.cloth
     candidates = np.asarray(predictor.scales.candidates)
     vertices, count = candidates.shape
     rows = blended(g, transforms, np.asarray(predictor.body))
@@ -201,7 +220,12 @@ def _contact(g: Graph, model: Model, it: Parts, held: str, transforms: str, adva
     face = g("GatherElements", every, nearest, axis=2)  # [N, V, 1]
     face = g("Transpose", face, perm=[0, 2, 1])
     face = g("Concat", face, face, face, axis=1)
-    point, normal = (g("GatherElements", x, face, axis=2) for x in (centres, normals))
+    return g("GatherElements", centres, face, axis=2), g("GatherElements", normals, face, axis=2)
+
+
+def _contact(g: Graph, model: Model, held: str, point: str, normal: str) -> str:
+    """Forces [N, 3, V] in N of planes that are touched."""
+    physics = model.config.physics
     gap = _dot(g, g("Sub", held, point), normal)
     depth = g("Relu", g("Sub", np.float32(physics.collision_offset), gap))
     return g("Mul", g("Mul", g("Mul", depth, depth), np.float32(3.0 * physics.collision_stiffness)), normal)

@@ -17,6 +17,7 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
+#define DEEPEST 0.02f     /* m, by which a vertex that would be shown in the body is pushed out at most */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
@@ -45,6 +46,7 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     const int32_t *face, *candidate;                  /* [3][faces], [candidates][vertices] */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
     const float *weight;                              /* [moving][vertices] */
+    const int32_t *nearest;                           /* [vertices that are shown], the vertex that feels at each */
     const float *middle, *inverse_spread;             /* of the inputs [(2 + KINDS) code], over BOUND */
     layer unshape, unmix, undecode[MOST_HIDDEN], first; /* transposed shapes, mix, layers of the decoder */
     layer read_fine;                                  /* the rest of the decoder's first, in sixteen bits */
@@ -78,6 +80,7 @@ struct psi_state {
     int pushed; /* whether the external acceleration was finite */
     float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
     float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
+    float *plane;                                  /* [4], normal and place of what is touched, from the last root */
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
 
@@ -233,6 +236,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->body_weight = floats(r, (size_t)m->moving * padded(f->body));
     f->body_rest = floats(r, 3 * (size_t)padded(f->body));
     f->weight = m->apart ? floats(r, (size_t)m->moving * padded(f->vertices)) : m->weight;
+    if (m->apart) f->nearest = indices(r, padded(m->vertices), f->vertices);
     f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
     f->inverse_spread = floats(r, (2 + KINDS) * (size_t)m->code);
     f->read_fine = read_layer(r, m);
@@ -685,8 +689,12 @@ static void push_contact(const psi_model *m, psi_state *s, float *force) {
             const float size = square > 1e-30f ? inverse_root(square) : 0.0f;
             const float gap = size * (at[0] * normal[0] + at[1] * normal[1] + at[2] * normal[2]);
             const float depth = gap < f->offset ? f->offset - gap : 0.0f;
-            for (int c = 0; c < 3; c++)
-                force[c * wide + v + i] = 3.0f * f->stiffness * depth * depth * size * normal[c];
+            float *plane = s->plane + v + i;
+            for (int c = 0; c < 3; c++) {
+                plane[c * wide] = size * normal[c];
+                force[c * wide + v + i] = 3.0f * f->stiffness * depth * depth * plane[c * wide];
+            }
+            plane[3 * wide] = plane[0] * x[i] + plane[wide] * y[i] + plane[2 * wide] * z[i] - gap;
         }
     }
 }
@@ -923,6 +931,19 @@ static void show(const psi_model *m, const psi_state *s, float *vertices) {
         for (int c = 0; c < 3; c++) vertices[3 * v + c] = s->position[c * wide + v] + s->translation[c];
 }
 
+/* Pushes vertices [vertices][3] that are shown out of the planes that the garment touches. */
+static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
+    const float *last = s->translation + 3;
+    const size_t wide = padded(m->f.vertices);
+    for (int32_t v = 0; v < m->vertices; v++) {
+        const float *plane = s->plane + (m->apart ? m->f.nearest[v] : v);
+        float *x = vertices + 3 * v, gap = -plane[3 * wide];
+        for (int c = 0; c < 3; c++) gap += plane[c * wide] * (x[c] - last[c]);
+        const float depth = gap < m->f.offset ? m->f.offset - gap : 0.0f, push = depth < DEEPEST ? depth : DEEPEST;
+        for (int c = 0; c < 3; c++) x[c] += push * plane[c * wide];
+    }
+}
+
 /* Lets the garment hang on a body that stands. */
 static void settle(const psi_model *m, psi_state *s) {
     const size_t wide = padded(m->f.vertices);
@@ -966,6 +987,7 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     } else if (vertices) {
         skin(m, s, decode(m, s, &m->shapes), vertices);
     }
+    if (vertices && m->forced) push_out(m, s, vertices);
     s->outside = (finite && s->pushed ? 0 : PSI_NOT_FINITE) | (ordinary ? 0 : PSI_POSE) | (m->known ? 0 : PSI_WEARER) |
                  (inside ? 0 : PSI_CODE);
     return s->outside == 0;
@@ -1000,6 +1022,7 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->held = part(room, &used, 3 * vertices);
     s->blended = part(room, &used, 12 * vertices);
     s->force = part(room, &used, 3 * KINDS * vertices);
+    s->plane = part(room, &used, 4 * vertices);
     s->body = part(room, &used, 3 * (size_t)padded(m->f.body));
     s->centre = part(room, &used, 3 * (size_t)padded(m->f.faces));
     for (int k = 0; k < KINDS; k++) s->pulled[k] = part(room, &used, 2 * (size_t)m->widest);

@@ -15,13 +15,13 @@ from clothjax.networks.normalisation import ForceScales, Whitening
 from clothjax.runtime.models import (
     Bounds,
     Cloth,
+    Felt,
     FoldedLayer,
     ForcePredictor,
     Layer,
     Model,
     Network,
     PosePredictor,
-    Shown,
     Wearer,
 )
 from clothjax.types import Material, Mesh, Rest
@@ -88,7 +88,7 @@ def from_safetensors(path: str | Path) -> Model:
             params = {
                 name.removeprefix(within).replace(".", "/"): x for name, x in arrays.items() if name.startswith(within)
             }
-            felt = fields(Shown, f"{own}.felt") if f"{own}.felt.shapes" in arrays else None
+            felt = fields(Felt, f"{own}.felt") if f"{own}.felt.shapes" in arrays else None
             whitening = fields(Whitening, f"{own}.scales.whitening")
             scales = fields(ForceScales, f"{own}.scales", whitening=whitening)
             parts = {"params": nested(params), "scales": scales, "mesh": fields(Mesh, f"{own}.mesh"), "felt": felt}

@@ -48,25 +48,14 @@ def felt(position: Array, surface: tuple[Array, Array], candidates: Array) -> Co
     return Contact(point, point, normal, normal, face)
 
 
-def on_vertices(
-    position: Array,
-    step: TimeStep,
-    surface: tuple[Array, Array] | None,
-    candidates: Array,
-    mesh: Mesh,
-    around: Array,
-    config: PhysicsConfig,
-) -> Array:
+def on_vertices(position: Array, step: TimeStep, mesh: Mesh, around: Array, config: PhysicsConfig) -> Array:
     """Return the forces [3, V, 3] in N on a garment: for each of `KINDS`, minus the gradient of its energies.
 
     Args:
         position: [V, 3] m, the held garment at the next frame.
-        step: the time step; its contact is not used.
-        surface: as of `felt`; None where there is no body to touch.
-        candidates: [V, K] int32, as of `felt`.
+        step: the time step, with the contact of `felt`.
         around: [V, D] int32, of `elastic_forces.around` for the mesh.
     """
-    step = step._replace(contact=None if surface is None else felt(position, surface, candidates))
 
     def force(names: tuple[str, ...]) -> Array:
         def energy(new: Array) -> Array:
@@ -93,9 +82,13 @@ def reduced(
 
     Args:
         garment: from a code to vertices [V, 3] m at the next frame.
+        step: the time step; its contact is not used.
+        surface: as of `felt`; None where there is no body to touch.
+        candidates: [V, K] int32, as of `felt`.
         mesh: on the host.
     """
     position, pullback = jax.vjp(garment, code)
     around = elastic_forces.around(mesh, len(position))
-    forces = on_vertices(position, step, surface, candidates, mesh, around, config)
+    step = step._replace(contact=None if surface is None else felt(position, surface, candidates))
+    forces = on_vertices(position, step, mesh, around, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

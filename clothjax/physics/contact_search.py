@@ -175,6 +175,21 @@ def distance(
     return jnp.sum((positions - points) * normals, axis=-1)
 
 
+def pushed_out(
+    positions: Float[Array, "V 3"],
+    points: Float[Array, "V 3"],
+    normals: Float[Array, "V 3"],
+    apart: float,
+    farthest: float,
+) -> Float[Array, "V 3"]:
+    """Return positions [V, 3] m, those less than `apart` m outside their planes moved along the normals to there.
+
+    None is moved by more than `farthest` m: what seems deeper inside is beside the body, behind a plane that ends.
+    """
+    depth = jnp.clip(apart - distance(positions, points, normals), 0.0, farthest)
+    return positions + depth[:, None] * normals
+
+
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
     """Unit normals [V, 3] of the face, edge or vertex at barycentric coordinates [V, 3], and whether it is a border."""
     normals = unit(jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))

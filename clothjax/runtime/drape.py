@@ -12,9 +12,10 @@ from clothjax.networks import forces, psi
 from clothjax.physics import contact_search, incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network, Shown
-from clothjax.types import Array, Pose
+from clothjax.types import Array, Contact, Pose
 
 HIGHEST = jax.lax.Precision.HIGHEST
+DEEPEST = 0.02  # m, by which a vertex that would be shown in the body is pushed out of it at most
 
 
 def blend_weights(network: Network, latent: Array, config: Config) -> Array:
@@ -29,23 +30,33 @@ def blend_weights(network: Network, latent: Array, config: Config) -> Array:
     return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
 
 
-def shown(model: Model, latent: Array, drape: Drape | None, transforms: Array) -> Array:
-    """Return the vertices [V, 3] m that are shown, relative to the root's translation.
+def shown(model: Model, latent: Array, transforms: Array) -> Array:
+    """Return the vertices [V, 3] m of a code [C], relative to the root's translation.
 
     Args:
-        latent: [C].
-        drape: after the step, of a Psi with forces; what it feels is often what is shown.
         transforms: [J', 3, 4] of the joints.
     """
-    if drape is not None and _forces(model).felt is None:
-        return drape.position
     garment = _canonical(model, latent, Shown(model.network.shapes, model.network.weights), model.wearer.template)
     return _skin(_rows(model.network.weights, transforms), garment).T
 
 
+def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, transforms: Array) -> Array:
+    """Return the vertices [V, 3] m of a Psi with forces, pushed to where the body pushes no more; arguments of `shown`.
+
+    Args:
+        drape: after the step; what it feels is often what is shown.
+        planes: of `predict`, relative to the root's translation.
+    """
+    felt = _forces(model).felt
+    garment = drape.position if felt is None else shown(model, latent, transforms)
+    nearest = slice(None) if felt is None else felt.nearest
+    offset = model.config.physics.collision_offset
+    return contact_search.pushed_out(garment, planes.point_next[nearest], planes.normal_next[nearest], offset, DEEPEST)
+
+
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:
     """Return how the garment of a Psi with forces hangs for a code [L], at rest; arguments as of `shown`."""
-    felt, template = _felt(model)
+    felt, template = felt_garment(model)
     garment = _canonical(model, latent, felt, template)
     position = _skin(_rows(felt.weights, transforms), garment).T
     return Drape(jnp.zeros_like(latent), garment, position, jnp.zeros_like(position))
@@ -53,8 +64,8 @@ def begin(model: Model, latent: Array, transforms: Array) -> Drape:
 
 def predict(
     model: Model, latent: Array, drape: Drape, transforms: Array, pose: Pose, advance: Array, external: Array | None
-) -> Array:
-    """Return the next code [L], not yet clipped, from the forces on the held garment at the next frame.
+) -> tuple[Array, Contact]:
+    """Predict the next code from the forces on the held garment at the next frame.
 
     Args:
         latent, drape: of the current frame.
@@ -62,33 +73,35 @@ def predict(
         pose: of the next frame.
         advance: [3] m, the root's step to it.
         external: [3] m/s^2 or None, as of `inference.step`.
+
+    Returns:
+        The code [L], not yet clipped, and the planes that the garment touches, as of `forces.felt`.
     """
     parts, cloth, config = _forces(model), model.wearer.cloth, model.config
     assert cloth is not None
-    felt, _ = _felt(model)
+    felt, _ = felt_garment(model)
     rows, timestep = _rows(felt.weights, transforms), 1.0 / config.fps
     held = (_skin(rows, drape.garment) + advance[:, None]).T
     body = skinning.pose_corrected(parts.corrections, cloth.body, pose)
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
+    planes = forces.felt(held, contact_search.centroids(posed, parts.faces), parts.scales.candidates)
     step = TimeStep(
         position=drape.position,
         velocity=incremental_potential.pushed(drape.velocity, timestep, external),
         mass=cloth.mass,
         rest=cloth.rest,
         material=cloth.material,
-        contact=None,
+        contact=planes,
         touching=None,
         timestep=jnp.float32(timestep),
     )
-    surface = contact_search.centroids(posed, parts.faces)
-    on_vertices = forces.on_vertices(
-        held, step, surface, parts.scales.candidates, parts.mesh, parts.around, config.physics
-    )
+    on_vertices = forces.on_vertices(held, step, parts.mesh, parts.around, config.physics)
     carried_back = jnp.einsum("abv,kva->kbv", rows[:, :3], on_vertices, precision=HIGHEST)
     on_weights = jnp.matmul(carried_back.reshape(len(forces.KINDS), -1), felt.shapes.T, precision=HIGHEST)
     _, pullback = jax.vjp(lambda code: blend_weights(model.network, code, config), latent)
     pulls = jax.vmap(lambda force: pullback(force)[0])(on_weights)
-    return psi.next_code(parts.params, parts.scales, latent, drape.change, pulls, cloth.constants, config.stage2)
+    code = psi.next_code(parts.params, parts.scales, latent, drape.change, pulls, cloth.constants, config.stage2)
+    return code, planes._replace(point_next=planes.point_next - advance[None])
 
 
 def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms: Array, advance: Array) -> Drape:
@@ -99,7 +112,7 @@ def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms:
         drape: before the step.
         transforms, advance: as of `predict`.
     """
-    felt, template = _felt(model)
+    felt, template = felt_garment(model)
     garment = _canonical(model, latent, felt, template)
     position = _skin(_rows(felt.weights, transforms), garment).T
     return Drape(latent - before, garment, position, position + advance[None] - drape.position)
@@ -110,13 +123,13 @@ def _forces(model: Model) -> ForcePredictor:
     return model.network.predictor
 
 
-def _felt(model: Model) -> tuple[Shown, Array]:
+def felt_garment(model: Model) -> tuple[Shown, Array]:
     """Return the garment that feels, and its template [3, V] m."""
     felt, cloth = _forces(model).felt, model.wearer.cloth
     if felt is None:
         return Shown(model.network.shapes, model.network.weights), model.wearer.template
     assert cloth is not None and cloth.template is not None
-    return felt, cloth.template
+    return Shown(felt.shapes, felt.weights), cloth.template
 
 
 def _canonical(model: Model, latent: Array, garment: Shown, template: Array) -> Array:

@@ -95,7 +95,7 @@ def _advanced(
     )
     advance = translation[:2] - translation[1:]
     transforms = _transforms(model, global_rotations, joints)
-    hung = state.drape
+    hung, planes = state.drape, None
     if isinstance(network.predictor, PosePredictor):
         if external is not None:
             raise ValueError(NOT_FELT)
@@ -105,7 +105,7 @@ def _advanced(
     else:
         assert hung is not None
         ordinary = True
-        latent = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
+        latent, planes = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
     latent, inside = normalisation.bounded(latent, *network.code_bounds)
     if hung is not None:
         hung = drape.follow(model, latent, state.latent, hung, transforms, advance[0])
@@ -113,7 +113,11 @@ def _advanced(
     following = State(latent, rotations[:2], positions[:2], translation[:2], outside, hung)
     if not vertices:
         return following, None
-    return following, drape.shown(model, latent, hung, transforms) + pose.translation[None]
+    if hung is None or planes is None:
+        shown = drape.shown(model, latent, transforms)
+    else:
+        shown = drape.shown_outside(model, latent, hung, planes, transforms)
+    return following, shown + pose.translation[None]
 
 
 def _transforms(model: Model, rotation: Array, places: Array) -> Array:

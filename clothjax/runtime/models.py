@@ -61,6 +61,14 @@ class Shown(NamedTuple):
     weights: Array  # [J', V] skinning weights of the joints `Model.moving`
 
 
+class Felt(NamedTuple):
+    """The garment that feels the forces, where it is not the one that is shown."""
+
+    shapes: Array  # [K, 3 V] m, as of `Shown`
+    weights: Array  # [J', V]
+    nearest: Array  # [V'] int32, the vertex at each one that is shown
+
+
 class ForcePredictor(NamedTuple):
     """The latent predictor of a Psi with forces, and the geometry on which it feels them."""
 
@@ -71,7 +79,7 @@ class ForcePredictor(NamedTuple):
     faces: Array  # [F, 3] int32 of the part of the body that can be touched
     body: Array  # [J', B] skinning weights of that part
     corrections: Array | None  # [B, 3, 9 (J - 1)] m, its pose blend shapes
-    felt: Shown | None  # the garment that feels, if it is not the one that is shown
+    felt: Felt | None  # the garment that feels, if it is not the one that is shown
 
 
 class Network(NamedTuple):

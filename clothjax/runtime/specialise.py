@@ -14,7 +14,7 @@ from clothjax.files import storage
 from clothjax.geometry import proximity
 from clothjax.runtime.drape import blend_weights
 from clothjax.runtime.inference import rollout
-from clothjax.runtime.models import Bounds, FoldedLayer, ForcePredictor, Layer, Model, Network, PosePredictor, Shown
+from clothjax.runtime.models import Bounds, Felt, FoldedLayer, ForcePredictor, Layer, Model, Network, PosePredictor
 from clothjax.types import Array, Garment, Motion
 
 FOLD_RATIO = 0.75  # folding must leave at most this part of the weights of the layers around the code
@@ -164,7 +164,7 @@ def part(model: Model, vertices: Array) -> Model:
     number = np.full(model.wearer.template.shape[-1], -1)
     number[vertices] = np.arange(len(vertices))
     faces = number[np.asarray(model.faces)]
-    model = _feeling_itself(model)
+    model = _feeling_apart(model, vertices)
     network = model.network._replace(
         shapes=_rows(model.network)[:, :, vertices].reshape(len(model.network.shapes), -1),
         weights=model.network.weights[:, vertices],
@@ -177,13 +177,21 @@ def part(model: Model, vertices: Array) -> Model:
     )
 
 
-def _feeling_itself(model: Model) -> Model:
-    """Return a model that feels the forces on the garment which is now shown, whatever is shown later."""
+def _feeling_apart(model: Model, nearest: np.ndarray) -> Model:
+    """Return a model that goes on to feel the forces on the garment of now when another is shown.
+
+    Args:
+        nearest: [V'] the vertex of the garment that is shown now at each of the other.
+    """
     predictor, cloth = model.network.predictor, model.wearer.cloth
-    if isinstance(predictor, PosePredictor) or cloth is None or predictor.felt is not None:
+    if isinstance(predictor, PosePredictor) or cloth is None:
         return model
-    predictor = predictor._replace(felt=Shown(model.network.shapes, model.network.weights))
-    cloth = cloth._replace(template=model.wearer.template)
+    if predictor.felt is None:
+        felt = Felt(model.network.shapes, model.network.weights, jnp.asarray(nearest, jnp.int32))
+        cloth = cloth._replace(template=model.wearer.template)
+    else:
+        felt = predictor.felt._replace(nearest=predictor.felt.nearest[nearest])
+    predictor = predictor._replace(felt=felt)
     return dataclasses.replace(
         model, network=model.network._replace(predictor=predictor), wearer=model.wearer._replace(cloth=cloth)
     )
@@ -211,7 +219,7 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     corners = np.asarray(_rows(model.network))[:, :, faces[face]]
     shapes = np.einsum("kcvi,vi->kcv", corners, weights)
     shapes[:, :, np.asarray(garment.pinned)] = 0.0
-    model = _feeling_itself(model)
+    model = _feeling_apart(model, faces[face, weights.argmax(axis=1)])
     network = model.network._replace(
         shapes=jnp.asarray(shapes.reshape(len(shapes), -1)),
         weights=jnp.asarray(garment.weights).T[np.array(model.moving)],

@@ -23,7 +23,7 @@ def test_a_kind_is_minus_the_gradient_of_its_energies_that_there_are(without):
         step = step._replace(material=step.material._replace(bending=10.0), contact=None, touching=None)
         position = vertices + 0.01 * random.normal(size=vertices.shape)
         around = elastic_forces.around(mesh, len(vertices))
-        found = forces.on_vertices(position, step, None, np.zeros((len(vertices), 1), int), mesh, around, config)
+        found = forces.on_vertices(position, step, mesh, around, config)
 
         def energy(names, new):
             terms = incremental_potential.energies(new, step, mesh, config)

@@ -9,9 +9,9 @@ from samples import random_force_psi, random_model
 import clothjax as cj
 from clothjax.evaluation import rollouts
 from clothjax.material import configured_material
-from clothjax.networks import animators, normalisation
+from clothjax.networks import animators, forces, normalisation, phi
 from clothjax.physics.energies import GRAVITY
-from clothjax.runtime import inference, loading, specialise, trained
+from clothjax.runtime import drape, inference, loading, specialise, trained
 from clothjax.simulation import assembly, characters, rollout
 from clothjax.types import ClothState, Material, Motion, Pose
 
@@ -62,13 +62,35 @@ def test_it_is_the_animator_of_training(forced, model, motion):
     assert min(moved) > 1e-3  # it does not merely hold the code
 
 
-def test_vertices_are_its_garment_in_the_world(model, motion):
-    state = inference.initial_state(model, pose(motion, 0))
-    state, vertices = inference.step(model, state, pose(motion, 1))
-    np.testing.assert_allclose(vertices, state.drape.position + motion.translation[1][None], atol=1e-6)
-    unseen, nothing = inference.step(model, inference.initial_state(model, pose(motion, 0)), pose(motion, 1), False)
+def test_vertices_are_its_garment_in_the_world_outside_of_what_it_feels(forced, model, motion):
+    """The planes are those of the held garment at the new pose, found here by the scene of training."""
+    experiment = forced.experiment
+    config, scene = experiment.config, experiment.scene
+    character = characters.dress(
+        scene, jnp.linspace(-1, 1, 10), jax.tree.map(jnp.float32, configured_material(config)), config.physics
+    )
+    before = inference.initial_state(model, pose(motion, 1))
+    after, vertices = inference.step(model, before, pose(motion, 2))
+    window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
+    held = phi.decode(forced.garment, scene, character, before.latent, window, config.model)
+    planes = forces.felt(held, characters.surface(scene, window.following), jnp.asarray(forced.scales.candidates))
+    garment = np.asarray(after.drape.position + motion.translation[2][None])
+    root, point, normal = (np.asarray(x) for x in (motion.translation[1], planes.point_next, planes.normal_next))
+
+    def apart(vertices):
+        return np.sum((np.asarray(vertices) - root - point) * normal, axis=1)
+
+    depth = config.physics.collision_offset - apart(garment)
+    outside, far = depth <= 0, depth > drape.DEEPEST
+    assert min(outside.sum(), far.sum(), (~outside & ~far).sum()) > 10
+    moved = np.asarray(vertices) - garment
+    np.testing.assert_allclose(moved[outside], 0.0, atol=1e-6)
+    np.testing.assert_allclose(moved[far], drape.DEEPEST * normal[far], atol=2e-5)
+    np.testing.assert_allclose(apart(vertices)[~outside & ~far], config.physics.collision_offset, atol=2e-5)
+    np.testing.assert_allclose(np.cross(moved, normal), 0.0, atol=2e-5)  # by the shortest way
+    unseen, nothing = inference.step(model, before, pose(motion, 2), False)
     assert nothing is None
-    np.testing.assert_allclose(unseen.latent, state.latent, atol=1e-6)
+    np.testing.assert_allclose(unseen.latent, after.latent, atol=1e-6)
 
 
 def test_an_acceleration_against_gravity_is_no_gravity(forced, motion):
