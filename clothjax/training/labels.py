@@ -30,6 +30,7 @@ WILD = (2.0, 0.2)  # a code of Psi's with more energy than so often the held one
 LOST = 200.0  # J, from which on a frame is left out
 ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertices
 STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
+SAME = 0.85  # share of what Psi's code lacked in the last frame that a label also tries to start with
 PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
 
 
@@ -93,8 +94,10 @@ def make_segment(scene: Scene, config: Config) -> Callable:
         def precondition(gradient: Array) -> Array:
             return jnp.matmul(policy.inverse_hessian, gradient, precision="highest")
 
-        def frame(state: ClothState, inputs: tuple[Pose, Array]) -> tuple[ClothState, Labels]:
-            poses, key = inputs
+        def frame(
+            carry: tuple[ClothState, Array], inputs: tuple[Pose, Array]
+        ) -> tuple[tuple[ClothState, Array], Labels]:
+            (state, lag), (poses, key) = carry, inputs
             window = characters.window(scene, character, poses)
             step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config, external)
             held = state.latent
@@ -109,7 +112,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             pulls = forces.reduced(garment, held, step, surface, scales.candidates, scene.mesh, config.physics)
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
-            starts = jnp.stack([held, held + state.change, code])
+            starts = jnp.stack([held, held + state.change, code, code + SAME * lag])
             energies = jax.lax.map(lambda z: potential(garment(z)), starts)
             start = starts[jnp.argmin(jnp.where(jnp.isnan(energies), jnp.inf, energies))]
             target, _ = descent.converge(
@@ -128,7 +131,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             new = garment(taken)
             velocity = new - state.position
             state = ClothState(new, velocity, velocity - state.velocity, taken, taken - held)
-            return rollout.follow(state, poses.translation[2]), labels
+            return (rollout.follow(state, poses.translation[2]), target - code), labels
 
         still = jax.random.uniform(still_key) < STILL
         windows = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
@@ -138,7 +141,8 @@ def make_segment(scene: Scene, config: Config) -> Callable:
         )
         poses = jax.tree.map(lambda x, y: jnp.where(still, x, y), stood, windows)
         keys = jax.random.split(noise_key, settings.frames)
-        cloth, labels = jax.lax.scan(frame, simulation.cloth, (poses, keys))
+        begun = simulation.cloth, jnp.zeros_like(simulation.cloth.latent)
+        (cloth, _), labels = jax.lax.scan(frame, begun, (poses, keys))
         goes_on = (
             jnp.all(usable(labels))
             & (clips.remaining[simulation.frame] > 2 * settings.frames)
