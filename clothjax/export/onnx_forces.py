@@ -138,13 +138,26 @@ def _momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
 
 
 def _elasticity(g: Graph, model: Model, it: Parts, held: str) -> str:
-    """Elastic forces [N, 3, V] in N, as of `elastic_forces.elastic`."""
-    mesh, table = it.predictor.mesh, np.asarray(it.predictor.around, np.int64)
+    """Elastic forces [N, 3, V] in N: minus the gradient of the stretching and bending energies, in closed form."""
+    mesh, vertices = it.predictor.mesh, it.template.shape[1]
+    table = _around([np.asarray(mesh.faces), np.asarray(mesh.hinges)], vertices)
     gradients = _stretching(g, it, held, np.asarray(mesh.faces))
     gradients += _bending(g, model, it, held, np.asarray(mesh.hinges))
     rows = g("Pad", g("Concat", *gradients, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
     gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 3, *table.shape)
     return g("Neg", g("ReduceSum", gathered, np.array([3], np.int64), keepdims=0))
+
+
+def _around(elements: list[np.ndarray], vertices: int) -> np.ndarray:
+    """Return the corners of elements at each vertex [V, D] int64; rows end with the number of corners.
+
+    Corners are numbered by the elements, then by their place in one, then by the element.
+    """
+    corners = np.concatenate([each.T.reshape(-1) for each in elements])
+    order, counts = np.argsort(corners, kind="stable"), np.bincount(corners, minlength=vertices)
+    table = np.full((vertices, counts.max(initial=1)), len(corners))
+    table[np.repeat(np.arange(vertices), counts), np.concatenate([np.arange(count) for count in counts])] = order
+    return table
 
 
 def _stretching(g: Graph, it: Parts, held: str, faces: np.ndarray) -> list[str]:

@@ -545,7 +545,7 @@ static void skin(const psi_model *m, psi_state *s, const float *garment, float *
     }
 }
 
-/* forces: clothjax/runtime/drape.py and clothjax/physics/elastic_forces.py */
+/* forces: clothjax/runtime/drape.py; elastic ones in closed form */
 
 /* An exact layer, into y. */
 static void dense_exact(const exact *e, const float *x, float *y, float *spare, psi_state *s) {

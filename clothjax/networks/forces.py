@@ -8,16 +8,13 @@ import numpy as np
 
 from clothjax.config import PhysicsConfig
 from clothjax.networks.normalisation import Whitening
-from clothjax.physics import elastic_forces, incremental_potential
+from clothjax.physics import incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.types import Array, Contact, Mesh
 
-MOMENTUM = ("inertia", "gravity")  # to where the cloth would fly freely
-ELASTICITY = ("stretching", "bending")
-CONTACT = ("collision",)
-KINDS = {"momentum": MOMENTUM, "elasticity": ELASTICITY, "contact": CONTACT}
-"""Terms of the incremental potential that make up each kind of force. Friction, and contact of edges
-and of cloth with itself, are not felt."""
+KINDS = {"momentum": ("inertia", "gravity"), "elasticity": ("stretching", "bending"), "contact": ("collision",)}
+"""Terms of the incremental potential that make up each kind of force: momentum is to where the cloth would fly freely.
+Friction, and contact of edges and of cloth with itself, are not felt."""
 SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its largest
 
 
@@ -48,13 +45,12 @@ def felt(position: Array, surface: tuple[Array, Array], candidates: Array) -> Co
     return Contact(point, point, normal, normal, face)
 
 
-def on_vertices(position: Array, step: TimeStep, mesh: Mesh, around: Array, config: PhysicsConfig) -> Array:
+def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:
     """Return the forces [3, V, 3] in N on a garment: for each of `KINDS`, minus the gradient of its energies.
 
     Args:
         position: [V, 3] m, the held garment at the next frame.
         step: the time step, with the contact of `felt`.
-        around: [V, D] int32, of `elastic_forces.around` for the mesh.
     """
 
     def force(names: tuple[str, ...]) -> Array:
@@ -64,9 +60,7 @@ def on_vertices(position: Array, step: TimeStep, mesh: Mesh, around: Array, conf
 
         return -jax.grad(energy)(position)
 
-    material = step.material._replace(bending=0.0) if "bending" in config.without else step.material
-    elastic = elastic_forces.elastic(position, step.rest, material, mesh, around)
-    return jnp.stack([force(MOMENTUM), elastic, force(CONTACT)])
+    return jnp.stack([force(names) for names in KINDS.values()])
 
 
 def reduced(
@@ -85,10 +79,8 @@ def reduced(
         step: the time step; its contact is not used.
         surface: as of `felt`; None where there is no body to touch.
         candidates: [V, K] int32, as of `felt`.
-        mesh: on the host.
     """
     position, pullback = jax.vjp(garment, code)
-    around = elastic_forces.around(mesh, len(position))
     step = step._replace(contact=None if surface is None else felt(position, surface, candidates))
-    forces = on_vertices(position, step, mesh, around, config)
+    forces = on_vertices(position, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

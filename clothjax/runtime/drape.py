@@ -95,7 +95,7 @@ def predict(
         touching=None,
         timestep=jnp.float32(timestep),
     )
-    on_vertices = forces.on_vertices(held, step, parts.mesh, parts.around, config.physics)
+    on_vertices = forces.on_vertices(held, step, parts.mesh, config.physics)
     carried_back = jnp.einsum("abv,kva->kbv", rows[:, :3], on_vertices, precision=HIGHEST)
     on_weights = jnp.matmul(carried_back.reshape(len(forces.KINDS), -1), felt.shapes.T, precision=HIGHEST)
     _, pullback = jax.vjp(lambda code: blend_weights(model.network, code, config), latent)

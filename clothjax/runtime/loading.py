@@ -15,7 +15,7 @@ from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
-from clothjax.physics import elastic_forces, energies
+from clothjax.physics import energies
 from clothjax.runtime import trained
 from clothjax.runtime.models import (
     Bounds,
@@ -65,14 +65,13 @@ def build(
     cloth = config.material
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
-    touched = mesh = around = None
+    touched = mesh = None
     if isinstance(normalizers, ForceScales):
         touched, candidates = _touched(garment, body, normalizers.candidates, config)
         normalizers = normalizers._replace(candidates=candidates)
         mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
-        around = elastic_forces.around(mesh, len(garment.vertices))
     network, wearer = _arrays(
-        garment, body, touched, mesh, around, garment_params, predictor, normalizers, betas, material, config
+        garment, body, touched, mesh, garment_params, predictor, normalizers, betas, material, config
     )
     return Model(
         network=network,
@@ -102,7 +101,6 @@ def _arrays(
     body: Body,
     touched: Body | None,
     mesh: Mesh | None,
-    around: Array | None,
     garment_params: dict,
     predictor: dict,
     normalizers: Normalizers | ForceScales,
@@ -114,20 +112,20 @@ def _arrays(
 
     Args:
         touched: the part of the body that is felt, and ...
-        mesh, around: ... the elements that feel; None without forces.
+        mesh: ... the elements that feel; None without forces.
     """
     given = psi.constant_inputs(betas, material, config.material)
     constants, known = psi.bounded_constants(given, config)
     template = skinning.shaped_vertices(garment, betas)
     bias, cloth, latent = jnp.zeros(0), None, None
     if isinstance(normalizers, ForceScales):
-        assert touched is not None and mesh is not None and around is not None
+        assert touched is not None and mesh is not None
         rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
         shaped = skinning.shaped_vertices(touched, betas)
         cloth = Cloth(constants, areas * material.density, rest, material, shaped, None)
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
-        parts = ForcePredictor(predictor, normalizers, mesh, around, touched.faces, weights, corrections, None)
+        parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, weights, corrections, None)
         bounds = Bounds(normalizers.low, normalizers.high, FORCE_SLACK * (normalizers.high - normalizers.low))
         first = jnp.zeros(len(normalizers.low))
     else:

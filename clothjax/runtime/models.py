@@ -75,7 +75,6 @@ class ForcePredictor(NamedTuple):
     params: dict  # of `psi.ForcePsi`
     scales: ForceScales
     mesh: Mesh  # of the garment's elements
-    around: Array  # [V, D] int32, of `elastic_forces.around`
     faces: Array  # [F, 3] int32 of the part of the body that can be touched
     body: Array  # [J', B] skinning weights of that part
     corrections: Array | None  # [B, 3, 9 (J - 1)] m, its pose blend shapes

@@ -9,7 +9,7 @@ from samples import sheet, time_step
 
 from clothjax.config import PhysicsConfig
 from clothjax.networks import forces
-from clothjax.physics import elastic_forces, incremental_potential
+from clothjax.physics import incremental_potential
 
 
 @pytest.mark.parametrize("without", [(), ("bending",), ("gravity",), ("bending", "gravity")])
@@ -22,8 +22,7 @@ def test_a_kind_is_minus_the_gradient_of_its_energies_that_there_are(without):
         step = time_step(vertices, mesh, velocity=0.01 * random.normal(size=vertices.shape))
         step = step._replace(material=step.material._replace(bending=10.0), contact=None, touching=None)
         position = vertices + 0.01 * random.normal(size=vertices.shape)
-        around = elastic_forces.around(mesh, len(vertices))
-        found = forces.on_vertices(position, step, mesh, around, config)
+        found = forces.on_vertices(position, step, mesh, config)
 
         def energy(names, new):
             terms = incremental_potential.energies(new, step, mesh, config)
