@@ -3,7 +3,7 @@
     python -m data_prep.amass 01_01_poses.npz out.h5 --body body.h5 --fps 30
 
 SMPL's poses are relative to a T-pose, so the skeleton of the recorded person is not needed. Hands and toes stay still.
-The files have z up; for others give --up y.
+Poses may be axis-angle, quaternions or matrices. The files have z up; others show that by how their figures stand.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.files.damage import UNREADABLE
 from clothjax.files.storage import Rig, canonical_rotation, load_rig
 from clothjax.types import Motion
+from data_prep import skeleton
 from data_prep.program import MotionOptions, run, write_motion
 from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
 from data_prep.smpl import BODY
@@ -24,11 +25,20 @@ from data_prep.smpl import BODY
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 
 
-def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+FASTEST, HIGHEST = 15.0, 10.0  # m/s and m, of a pelvis whose path is in metres
+
+
+def read_amass(path: str | Path, up: Literal["y", "z"] | None = None, units: str = "m") -> Capture:
     """Read a recording with +Y up and CMU's joint names; it has no skeleton, so its offsets are zero.
 
+    Args:
+        path: .npz.
+        up: axis that points up; None for the one along which the figures stand.
+        units: of the path, of `METRES`.
+
     Raises:
-        ValueError: naming the file, the array and the first wrong entry.
+        ValueError: naming the file, the array and the first wrong entry; for a path that is not in `units`.
     """
     try:
         with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -41,25 +51,58 @@ def read_amass(path: str | Path, up: Literal["y", "z"] = "z") -> Capture:
         raise
     except UNREADABLE as error:
         raise ValueError(f"{path}: not a motion of AMASS: {error}") from error
-    if poses.ndim == 3:
-        poses = poses.reshape(len(poses), -1)
-    if poses.ndim != 2 or poses.shape[1] < 3 * len(BODY) or trans.shape != (len(poses), 3):
-        raise ValueError(
-            f"{path}: poses {poses.shape} and trans {trans.shape}: expected [T, {3 * len(BODY)} or more] and [T, 3]"
-        )
-    for name, rows in (("poses", poses), ("trans", trans)):
+    if trans.ndim != 2 or trans.shape[1:] != (3,) or poses.ndim < 2 or len(poses) != len(trans):
+        raise ValueError(f"{path}: poses {poses.shape} and trans {trans.shape}: expected [T, ...] and [T, 3]")
+    for name, rows in (("poses", poses.reshape(len(poses), -1)), ("trans", trans)):
         wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(wrong):
             raise ValueError(f"{path}: {name} of frame {wrong[0]} is not finite: cut it out")
     if fps.size != 1 or not 0 < fps.item() < 1e4:
         raise ValueError(f"{path}: {rate} is {fps}, not a rate in Hz")
-    poses = poses[:, : 3 * len(BODY)].reshape(-1, 3)
-    rotations = Rotation.from_rotvec(poses).as_matrix().reshape(len(trans), len(BODY), 3, 3)
+    rotations = _matrices(poses, path)[:, : len(BODY)]
+    trans = trans * METRES[units]
+    stands = rotations[:, 0, :, 1].mean(axis=0)  # SMPL's pelvis has +y up
+    if up is None:
+        up = "y" if stands[1] > 0.6 and stands[1] > stands[2] else "z"
+    speed = np.linalg.norm(np.diff(trans, axis=0), axis=1).max(initial=0.0) * fps.item()
+    height = abs(float(np.median(trans[:, "xyz".index(up)])))
+    if units == "m" and (speed > FASTEST or height > HIGHEST):
+        found = f"up to {speed:.0f} m/s, {height:.0f} m high"
+        raise ValueError(f"{path}: trans looks like centimetres ({found}): give --units cm, or mm, or cut jumps out")
     if up == "z":
         turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
         rotations[:, 0] = turn @ rotations[:, 0]
         trans = trans @ turn.T
     return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, fps.item())
+
+
+def _matrices(poses: np.ndarray, path: str | Path) -> np.ndarray:
+    """Return rotations [T, J, 3, 3] of poses, which their shape and norms tell apart.
+
+    Args:
+        poses: axis-angle [T, 3 J] or [T, J, 3], quaternions [T, 4 J] or [T, J, 4], or matrices [T, J, 3, 3].
+        path: of the file, for messages.
+    """
+    frames, joints = len(poses), len(BODY)
+    if poses.shape[2:] == (3, 3):
+        turned = poses @ np.swapaxes(poses, -1, -2)
+        if poses.shape[1] >= joints and np.abs(turned - np.eye(3)).max() < 1e-2 and np.linalg.det(poses).min() > 0:
+            return poses.copy()
+        raise ValueError(f"{path}: poses {poses.shape} are no rotation matrices of {joints} joints")
+    flat = poses.reshape(frames, -1)
+    if (poses.ndim == 2 and flat.shape[1] % 4 == 0) or poses.shape[2:] == (4,):
+        fours = flat.reshape(frames, -1, 4)
+        unit = np.abs(np.linalg.norm(fours, axis=-1) - 1.0).max() < 1e-2
+        if unit and fours.shape[1] >= joints:
+            first, *_, last = np.abs(fours).mean(axis=(0, 1))  # that of the angle is largest: most joints turn little
+            order = fours[..., [1, 2, 3, 0]] if first > last else fours
+            return Rotation.from_quat(order.reshape(-1, 4)).as_matrix().reshape(frames, -1, 3, 3)
+    if (poses.ndim == 3 and poses.shape[2] != 3) or flat.shape[1] < 3 * joints or flat.shape[1] % 3:
+        raise ValueError(
+            f"{path}: poses {poses.shape}: expected axis-angle [T, J, 3], quaternions [T, J, 4] or matrices "
+            f"[T, J, 3, 3] of at least {joints} joints (6D: which convention it has is not seen; convert it)"
+        )
+    return Rotation.from_rotvec(flat.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
 
 
 def retarget_amass(
@@ -91,7 +134,7 @@ def retarget_amass(
     if lacking:
         raise ValueError(f"{body_file} has no joint {', '.join(lacking)}: name its joints as CMU's or SMPL's")
     rotations = from_t_pose(local, rig.body, names, canonical_rotation(body_file))
-    scale = leg_length({name: rig.body.joints[i] for i, name in enumerate(names)}) / leg
+    scale = leg_length(rig.body.joints, skeleton.find(names, rig.body.parents, str(body_file))) / leg
     path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale
     return stand(Motion(rotations.astype(np.float32), path, fps), rig.body), rig
 
@@ -103,15 +146,17 @@ class Arguments(MotionOptions):
     motion: tyro.conf.Positional[Path]
     """.npz as published."""
     output: tyro.conf.Positional[Path]
-    up: Literal["y", "z"] = "z"
-    """Axis of the file that points up."""
+    up: Literal["y", "z"] | None = None
+    """Axis of the file that points up; it is the one along which the figures stand unless given."""
+    units: Literal["m", "cm", "mm"] = "m"
+    """Unit of the path."""
     leg: float = 0.8
     """Length of the recorded person's leg, hip to ankle, m."""
 
 
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
-    capture = read_amass(args.motion, args.up)
+    capture = read_amass(args.motion, args.up, args.units)
     motion, rig = retarget_amass(capture, args.body, fps=args.fps, leg=args.leg, freeze=args.freeze)
     write_motion(args.output, motion, rig, args.motion, args)
 

@@ -15,8 +15,8 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
-from data_prep.program import MotionOptions, run, write_motion
-from data_prep.retarget import Capture, numbers, read_lines, retarget
+from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
+from data_prep.retarget import Capture, numbers, read_lines
 
 CMU_NAMES = {
     "root": "Hips",
@@ -179,7 +179,7 @@ def _check_frame(path: str | Path, line: int, values: dict[str, list], frames: i
 
 
 @dataclass(frozen=True)
-class Arguments(MotionOptions):
+class Arguments(SkeletonOptions):
     """Retarget an ASF/AMC recording onto a body."""
 
     skeleton: tyro.conf.Positional[Path]
@@ -199,9 +199,7 @@ class Arguments(MotionOptions):
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
     rig, capture = load_rig(args.body), read_amc(args.motion, read_asf(args.skeleton), args.source_fps)
-    motion = retarget(
-        capture, *rig, fps=args.fps, abduct=args.abduct, drop_clavicles=args.drop_clavicles, freeze=args.freeze
-    )
+    motion = retarget_as_asked(capture, rig, args, args.motion)
     write_motion(args.output, motion, rig, args.motion, args)
 
 

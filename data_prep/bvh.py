@@ -2,7 +2,8 @@
 
     python -m data_prep.bvh 01_01.bvh out.h5 --body body.h5 --fps 30 --skip 1
 
-Plain or .gz. Joints are matched by name: CMU's, Mixamo's and Daz's are known. Positions are read for the root only.
+Plain or .gz. Which joint is which is known of many programs (`skeleton.py`), or said with `--joints map.yaml`. The
+frames say which way is up, and how a joint is turned in a T-pose.
 """
 
 from dataclasses import dataclass
@@ -13,21 +14,11 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
-from data_prep.program import MotionOptions, run, write_motion
-from data_prep.retarget import Capture, cmu_names, numbers, read_lines, retarget
+from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
+from data_prep.retarget import Capture, cmu_names, numbers, read_lines
 
-DAZ_NAMES = {"hip": "Hips", "abdomen": "LowerBack", "chest": "Spine1", "neck": "Neck", "head": "Head"}
-for _letter, _side in (("l", "Left"), ("r", "Right")):
-    for _daz, _cmu in (
-        ("Collar", "Shoulder"),
-        ("Shldr", "Arm"),
-        ("ForeArm", "ForeArm"),
-        ("Hand", "Hand"),
-        ("Thigh", "UpLeg"),
-        ("Shin", "Leg"),
-        ("Foot", "Foot"),
-    ):
-        DAZ_NAMES[_letter + _daz] = _side + _cmu
+SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of motion capture
+STILL = 1e-3  # of the longest bone, by which a joint that does not move on its parent may move
 
 
 def read_bvh(path: str | Path) -> Capture:
@@ -55,23 +46,49 @@ def read_bvh(path: str | Path) -> Capture:
     if len(rows) != frames:
         raise ValueError(f"{path}, line {line}: {len(rows)} frames, {frames} announced; cut short?")
 
+    if not SLOWEST <= 1 / duration <= FASTEST:
+        raise ValueError(
+            f"{path}: a Frame Time of {duration:g} would be {1 / duration:.3g} frames a second: it is in seconds, "
+            f"such as {1 / 30:.4f}"
+        )
     values, column = np.array(rows), 0
     rotations = np.tile(np.eye(3), (frames, len(names), 1, 1))
-    translation = np.tile(offsets[0], (frames, 1))
+    places = np.tile(offsets, (frames, 1, 1))
     for j, own in enumerate(channels):
         axes = "".join(c[0] for c in own if c.endswith("rotation"))
         turning = [column + k for k, c in enumerate(own) if c.endswith("rotation")]
         if axes:
             rotations[:, j] = Rotation.from_euler(axes, values[:, turning], degrees=True).as_matrix()
-        for k, channel in enumerate(own):
-            if j == 0 and channel.endswith("position"):
-                translation[:, "XYZ".index(channel[0])] = values[:, column + k]
+        moving = [(column + k, "XYZ".index(c[0])) for k, c in enumerate(own) if c.endswith("position")]
+        # some programs write the place on the parent, some what is added to it
+        added = j > 0 and not np.any(values[:, [k for k, _ in moving]])
+        for k, axis in [] if added else moving:
+            places[:, j, axis] = values[:, k]
         column += len(own)
-    plain = [name.rpartition(":")[2] for name in names]  # Mixamo writes mixamorig:Hips
-    known = cmu_names(tuple(DAZ_NAMES.get(name, name) for name in plain))
     # CMU's rate is 120, its files say 0.0083333: without rounding every clip would be interpolated
-    rate = round(1 / duration, 2)
-    return Capture(known, np.array(parents), offsets, rotations, translation, rate)
+    return _below_the_path(cmu_names(tuple(names)), parents, places, rotations, round(1 / duration, 2))
+
+
+def _below_the_path(
+    names: tuple[str, ...], parents: list[int], places: np.ndarray, rotations: np.ndarray, fps: float
+) -> Capture:
+    """Return a recording whose root is the joint that moves: one above it, such as an armature, is left out.
+
+    Args:
+        names: of the joints.
+        parents: of the joints.
+        places: [T, n, 3] on their parents; of the root in the world.
+        rotations: [T, n, 3, 3] local.
+        fps: frames a second.
+    """
+    offsets = np.median(places, axis=0)
+    longest = np.linalg.norm(offsets[1:], axis=1).max(initial=0.0)
+    while parents.count(0) == 1 and np.ptp(places[:, 1], axis=0).max() > STILL * longest:
+        path = places[:, 0] + np.einsum("tab,tb->ta", rotations[:, 0], places[:, 1])
+        rotations = np.concatenate([rotations[:, :1] @ rotations[:, 1:2], rotations[:, 2:]], axis=1)
+        places = np.concatenate([path[:, None], places[:, 2:]], axis=1)
+        names, offsets, parents = names[1:], offsets[1:], [-1, *(parent - 1 for parent in parents[2:])]
+    return Capture(names, np.array(parents), offsets, rotations, places[:, 0], fps)
 
 
 def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarray, list[list[str]]]:
@@ -125,26 +142,20 @@ def _channels(path: str | Path, line: int, words: list[str]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Arguments(MotionOptions):
+class Arguments(SkeletonOptions):
     """Retarget a BVH recording onto a body."""
 
     motion: tyro.conf.Positional[Path]
     output: tyro.conf.Positional[Path]
     skip: int = 0
     """Frames left out at the start: in many files the first is an added T-pose."""
-    abduct: float = 0.0
-    """Degrees the upper arms are taken outward; 25 for CMU's recordings (see data_prep.asf_amc)."""
-    drop_clavicles: float = 0.0
-    """Degrees the clavicles are lowered; 15 for CMU's recordings."""
 
 
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
     rig, capture = load_rig(args.body), read_bvh(args.motion)
     capture = capture._replace(rotations=capture.rotations[args.skip :], translation=capture.translation[args.skip :])
-    motion = retarget(
-        capture, *rig, fps=args.fps, abduct=args.abduct, drop_clavicles=args.drop_clavicles, freeze=args.freeze
-    )
+    motion = retarget_as_asked(capture, rig, args, args.motion)
     write_motion(args.output, motion, rig, args.motion, args)
 
 

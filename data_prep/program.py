@@ -4,12 +4,14 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
 from clothjax.types import Motion
+from data_prep import skeleton
 from data_prep.repair import Bad, mend
+from data_prep.retarget import Axes, Capture, retarget
 
 
 def run(main: Callable[[Any], None], arguments: type, description: str) -> None:
@@ -38,6 +40,55 @@ class MotionOptions:
     """Treatment of frames with a movement that no body can make: `keep` them, `repair` them by interpolation, or `drop`
     all but the longest stretch without any."""
     licence: str = "of the recording"
+
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkeletonOptions(MotionOptions):
+    """Options of every program that reads a recording with a skeleton of its own."""
+
+    up: Axis | None = None
+    """Axis of the file that points up; it is read off the frames unless given."""
+    forward: Axis | None = None
+    """Axis of the file that becomes forward, +z; unless given, the figure keeps its heading."""
+    joints: Path | None = None
+    """File that says which joint is which part, `left upper arm: Bone.012`, for names that are not known."""
+    allow: bool = False
+    """Take a recording without arms or head, and a result that differs from the recording."""
+    abduct: float = 0.0
+    """Degrees the upper arms are taken outward; 25 for CMU's recordings (see data_prep.asf_amc)."""
+    drop_clavicles: float = 0.0
+    """Degrees the clavicles are lowered; 15 for CMU's recordings."""
+
+
+def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, recording: Path) -> Motion:
+    """Retarget a recording with the options of a program.
+
+    Raises:
+        ValueError: as `retarget`. If joints are not known, a mapping file to fill in is written and named.
+    """
+    if options.joints is None:
+        try:
+            skeleton.find(capture.names, capture.parents, str(recording), options.allow)
+        except ValueError as error:
+            draft = Path(f"{recording.name.partition('.')[0]}_joints.yaml")
+            draft.write_text(skeleton.guess(capture.names, capture.parents))
+            raise ValueError(f"{error}; {draft} is a first guess of one") from error
+    return retarget(
+        capture,
+        rig.body,
+        rig.names,
+        fps=options.fps,
+        abduct=options.abduct,
+        drop_clavicles=options.drop_clavicles,
+        freeze=options.freeze,
+        axes=Axes(options.up, options.forward),
+        joints=options.joints,
+        allow=options.allow,
+        about=str(recording),
+    )
 
 
 def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: MotionOptions) -> None:

@@ -1,9 +1,11 @@
 """Retargeting of a motion to a body with other bones and another canonical pose.
 
-World rotations of the joints are copied by name. Bones of arms and legs are first aligned with the source's rest pose,
-so that an A-pose and a T-pose agree. The root's path is scaled by the length of a leg.
+World rotations of the joints are copied by body part (`skeleton.py`), relative to how the joints are turned when the
+figure stands like the body (`rest_pose.py`). Bones of arms and legs are aligned, so that an A-pose and a T-pose agree.
+The root's path is scaled by the length of a leg. At last the result is compared with the recording.
 """
 
+import codecs
 from collections.abc import Iterator
 from gzip import open as open_gzip
 from pathlib import Path
@@ -14,6 +16,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from clothjax.body.plausibility import joint_positions
 from clothjax.types import Body, Motion
+from data_prep import skeleton
+from data_prep.rest_pose import AXES, Figure, figure, is_rest_pose, standing, turn_upright, unit, up_axis
+from data_prep.skeleton import Parts
 
 CMU_FROM_SMPL = {
     "pelvis": "Hips",
@@ -39,9 +44,9 @@ CMU_FROM_SMPL = {
     "right_ankle": "RightFoot",
     "right_foot": "RightToeBase",
 }
-_LIMBS = (("UpLeg", "Leg"), ("Leg", "Foot"), ("Foot", "ToeBase"), ("Arm", "ForeArm"), ("ForeArm", "Hand"))
-ALIGNED = {f"{side}{a}": f"{side}{b}" for side in ("Left", "Right") for a, b in _LIMBS}  # joint: end of its bone
 FROZEN = ("Hand", "Finger", "Thumb", "Toe")
+NEXT = {"upper arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot", "foot": "toe"}  # ends of bones
+MOST_APART = 20.0  # degrees, between a bone of the result and of the recording
 
 
 class Capture(NamedTuple):
@@ -60,6 +65,16 @@ def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(CMU_FROM_SMPL.get(n, n) for n in names)
 
 
+class Axes(NamedTuple):
+    """Axes of a file that point up and forward, such as `z` and `-y`; None to find out."""
+
+    up: str | None = None
+    forward: str | None = None
+
+
+FOUND = Axes()
+
+
 def retarget(
     capture: Capture,
     body: Body,
@@ -69,56 +84,153 @@ def retarget(
     abduct: float = 0.0,
     drop_clavicles: float = 0.0,
     freeze: bool = True,
+    axes: Axes = FOUND,
+    joints: Path | None = None,
+    allow: bool = False,
+    about: str = "the recording",
 ) -> Motion:
     """Retarget a recording onto a body's joints, starting above the origin and standing on y = 0.
 
     Args:
         capture: the recording.
         body: to move.
-        names: of its joints, CMU's or SMPL's.
+        names: of its joints.
         fps: frames per second of the result; rotations between two frames are interpolated on the sphere.
         abduct: degrees by which the upper arms are taken outward.
         drop_clavicles: degrees by which the clavicles are lowered.
         freeze: keep hands, fingers and toes as in the canonical pose; captured ones are often noise.
+        axes: of the recording.
+        joints: mapping file of `skeleton.mapped`, for names that are not known.
+        allow: take a recording without arms or head, and one from which the result differs.
+        about: name of the recording, for messages.
 
     Raises:
-        ValueError: if the recording has no joints for the root and a leg, or is shorter than two frames.
+        ValueError: if parts of the body are missing, or it is not seen which way is up; if the result differs from the
+            recording; if the recording is shorter than two frames.
     """
     capture = resample(capture, fps)
     names = cmu_names(names)
-    source = {name: i for i, name in reversed(list(enumerate(capture.names)))}
-    for needed in ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot"):
-        if needed not in source:
-            raise ValueError(f"the recording has no joint {needed!r}, only {', '.join(capture.names)}: rename them")
-        if needed not in names:
-            raise ValueError(f"the body has no joint {needed!r}, only {', '.join(names)}: rename them")
-    rest = np.zeros_like(capture.offsets)
-    turned = capture.rotations.copy()
-    for i, parent in enumerate(capture.parents):
-        if parent >= 0:
-            rest[i] = rest[parent] + capture.offsets[i]
-            turned[:, i] = turned[:, parent] @ turned[:, i]
+    of_body = skeleton.find(names, body.parents, "the body")
+    if joints is None:
+        of_file = skeleton.find(capture.names, capture.parents, about, allow)
+    else:
+        of_file = skeleton.mapped(capture.names, capture.parents, joints, allow)
+    shown = figure(capture.parents, capture.offsets, capture.rotations, capture.translation)
+    still = np.tile(np.eye(3), (1, len(capture.names), 1, 1))
+    resting = figure(capture.parents, capture.offsets, still, np.zeros((1, 3)))
+    up = axes.up or up_axis(shown, resting, of_file)
+    if up is None:
+        raise ValueError(f"{about}: it does not show which way is up: give --up y or --up z")
+    shown = shown.turned(turn_upright(AXES[up], None if axes.forward is None else AXES[axes.forward]))
+    rest = is_rest_pose(resting, of_file)
+    if rest is None:
+        reference = standing(shown, resting, capture.parents, of_file)
+    else:
+        reference = np.tile(turn_upright(AXES[rest]), (len(capture.names), 1, 1))
+    local = reference.copy()
+    local[1:] = np.swapaxes(reference[capture.parents[1:]], -1, -2) @ reference[1:]
+    posed = figure(capture.parents, capture.offsets, local[None], np.zeros((1, 3))).positions[0]
 
     corrections = _corrections(abduct, drop_clavicles)
-    world = np.zeros((len(turned), len(names), 3, 3))
-    for j, name in enumerate(names):
-        parent = body.parents[j]
-        if (freeze and any(part in name for part in FROZEN)) or name not in source:
+    pairs = _pairs(of_file, capture.names, of_body, names)
+    frozen = _beyond(body.parents, of_body) if freeze else set()
+    world = np.zeros((len(shown.positions), len(names), 3, 3))
+    for j, parent in enumerate(body.parents):
+        if j in frozen or j not in pairs:
             world[:, j] = world[:, parent] if parent >= 0 else np.eye(3)
             continue
+        part = next((part for part, joint in of_body.limbs.items() if joint == j), "")
+        end = f"{part.partition(' ')[0]} {NEXT.get(part.partition(' ')[2])}"
         align = np.eye(3)
-        end = ALIGNED.get(name)
-        if end in source and end in names:
-            target_bone = body.joints[names.index(end)] - body.joints[j]
-            align = _between(target_bone, rest[source[end]] - rest[source[name]])
-        world[:, j] = turned[:, source[name]] @ corrections.get(name, np.eye(3)) @ align
+        if end in of_file.limbs and end in of_body.limbs:
+            own, other = pairs[j], of_file.limbs[end]
+            align = _between(body.joints[of_body.limbs[end]] - body.joints[j], posed[other] - posed[own])
+        world[:, j] = shown.rotations[:, pairs[j]] @ reference[pairs[j]].T @ corrections.get(part, np.eye(3)) @ align
+    _fill(world, of_body, pairs)
     rotations = world.copy()
     rotations[:, 1:] = np.swapaxes(world[:, body.parents[1:]], -1, -2) @ world[:, 1:]
 
-    leg = {name: body.joints[names.index(name)] for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")}
-    scale = leg_length(leg) / leg_length({name: rest[source[name]] for name in leg})
-    path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale - body.joints[0]
-    return stand(Motion(rotations.astype(np.float32), path, float(fps)), body)
+    scale = leg_length(body.joints, of_body) / leg_length(posed, of_file)
+    path = shown.positions[:, of_file.hips]
+    path = (path - path[0] * [1, 0, 1]) * scale - body.joints[0]
+    motion = stand(Motion(rotations.astype(np.float32), path, float(fps)), body)
+    if not allow:
+        compare(motion, body, of_body, shown, of_file, about, abduct + drop_clavicles)
+    return motion
+
+
+def _pairs(of_file: Parts, file_names: tuple[str, ...], of_body: Parts, names: tuple[str, ...]) -> dict[int, int]:
+    """Return by joint of a body the joint of a file that moves it: by name where both have it, else by part."""
+    number = {name: i for i, name in reversed(list(enumerate(file_names)))}
+    known = {*of_file.chain, *of_file.limbs.values()}
+    pairs = {j: number[name] for j, name in enumerate(names) if name in number and number[name] not in known}
+    pairs |= {of_body.limbs[part]: joint for part, joint in of_file.limbs.items() if part in of_body.limbs}
+    for mine, other in ((of_body.spine, of_file.spine), (of_body.neck, of_file.neck)):
+        for k, joint in enumerate(other, 1):  # the last moves the last; of more than there are, the last of each share
+            if mine:
+                pairs[mine[max(k * len(mine) // len(other), 1) - 1]] = joint
+    return pairs | {of_body.hips: of_file.hips}
+
+
+def _beyond(parents: np.ndarray, parts: Parts) -> set[int]:
+    """Return hands and toes, and the joints that hang on them."""
+    ends = {joint for part, joint in parts.limbs.items() if part.endswith((" hand", " toe"))}
+    return {j for j in range(len(parents)) if ends & set(skeleton.ancestors(j, parents))}
+
+
+def _fill(world: np.ndarray, parts: Parts, pairs: dict[int, int]) -> None:
+    """Turn the joints of a trunk that the file does not have in equal shares between those around them."""
+    chain = parts.chain
+    moved = [k for k, joint in enumerate(chain) if joint in pairs]
+    for before, after in zip(moved, moved[1:], strict=False):
+        start, end = (Rotation.from_matrix(world[:, chain[k]]) for k in (before, after))
+        whole = (start.inv() * end).as_rotvec()
+        for k in range(before + 1, after):
+            share = (k - before) / (after - before)
+            world[:, chain[k]] = (start * Rotation.from_rotvec(share * whole)).as_matrix()
+
+
+def compare(
+    motion: Motion, body: Body, of_body: Parts, shown: Figure, of_file: Parts, about: str, allowance: float
+) -> None:
+    """Refuse a motion whose bones do not point where those of its recording do.
+
+    Args:
+        motion: of the body.
+        of_body, of_file: parts of the body and of the recording.
+        shown: the recording, +y up.
+        allowance: degrees by which arms may differ further, because that was asked for.
+
+    Raises:
+        ValueError: naming the part that differs most, with both directions.
+    """
+    positions = joint_positions(motion, body)
+
+    def directions(positions: np.ndarray, parts: Parts) -> dict[str, np.ndarray]:
+        limbs = parts.limbs
+        ends = {"trunk": (parts.hips, parts.chain[-1]), "hips": (limbs["right thigh"], limbs["left thigh"])}
+        for part, (side, own) in ((part, part.split(" ", 1)) for part in limbs):
+            end = f"{side} {NEXT.get(own)}"
+            if own in ("upper arm", "forearm", "thigh", "shin") and end in limbs:
+                ends[part] = (limbs[part], limbs[end])
+        return {part: unit(positions[:, end] - positions[:, start]) for part, (start, end) in ends.items()}
+
+    found, recorded = directions(positions, of_body), directions(shown.positions, of_file)
+    apart = {
+        part: np.degrees(np.arccos(np.clip(np.sum(found[part] * recorded[part], axis=1), -1.0, 1.0)))
+        - (allowance if part.endswith("arm") else 0.0)
+        for part in found.keys() & recorded.keys()
+    }
+    medians = {part: float(np.median(angles)) for part, angles in apart.items()}
+    worst = max(medians, key=lambda part: medians[part])
+    if medians[worst] > MOST_APART:
+        frame = int(np.argsort(apart[worst])[len(apart[worst]) // 2])
+        raise ValueError(
+            f"{about}: the {worst} would be {medians[worst]:.0f} degrees off: in frame {frame} it points to "
+            f"{np.round(recorded[worst][frame], 2).tolist()} in the recording, to "
+            f"{np.round(found[worst][frame], 2).tolist()} in the result (x left, y up, z forward). "
+            "Check --up and --joints; --allow takes it all the same"
+        )
 
 
 def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...], to_t_pose: np.ndarray) -> np.ndarray:
@@ -193,7 +305,10 @@ def read_lines(path: str | Path) -> Iterator[tuple[int, list[str]]]:
         ValueError: if the file cannot be read.
     """
     try:
-        with (open_gzip if str(path).endswith(".gz") else open)(path, "rt", errors="replace") as file:
+        opener = open_gzip if str(path).endswith(".gz") else open
+        with opener(path, "rb") as file:
+            marked = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        with opener(path, "rt", encoding="utf-16" if marked else "utf-8-sig", errors="replace") as file:
             for number, line in enumerate(file, 1):
                 words = line.split()
                 if words:
@@ -220,16 +335,16 @@ def numbers(path: str | Path, line: int, words: list[str], count: int | None = N
 
 
 def _corrections(abduct: float, drop_clavicles: float) -> dict[str, np.ndarray]:
-    """Return rotations [3, 3] by joint that take the upper arms outward and lower the clavicles, in degrees."""
+    """Return rotations [3, 3] by part that take the upper arms outward and lower the clavicles, in degrees."""
 
     def about_z(degrees: float) -> np.ndarray:
         return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
 
     return {
-        "LeftArm": about_z(abduct),
-        "RightArm": about_z(-abduct),
-        "LeftShoulder": about_z(-drop_clavicles),
-        "RightShoulder": about_z(drop_clavicles),
+        "left upper arm": about_z(abduct),
+        "right upper arm": about_z(-abduct),
+        "left clavicle": about_z(-drop_clavicles),
+        "right clavicle": about_z(drop_clavicles),
     }
 
 
@@ -240,7 +355,7 @@ def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return Rotation.align_vectors(end[None], start[None])[0].as_matrix()
 
 
-def leg_length(positions: dict[str, np.ndarray]) -> float:
-    """Return the length of the left leg, from hip to ankle, of joint positions by CMU's names."""
-    hip, knee, ankle = (positions[joint] for joint in ("LeftUpLeg", "LeftLeg", "LeftFoot"))
+def leg_length(positions: np.ndarray, parts: Parts) -> float:
+    """Return the length of the left leg, from hip to ankle, of joint positions [n, 3]."""
+    hip, knee, ankle = (positions[parts.limbs[f"left {part}"]] for part in ("thigh", "shin", "foot"))
     return float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))

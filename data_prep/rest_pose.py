@@ -1,0 +1,154 @@
+"""How the joints of a recording are turned when its figure stands like a body: from where its joints are in the frames.
+
+A file does not say which way is up, or that zero rotations are a T-pose. Both are read off its own positions.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from data_prep.skeleton import SIDES, Parts
+
+AXES = {sign + axis: (1 - 2 * (sign == "-")) * np.eye(3)["xyz".index(axis)] for axis in "xyz" for sign in ("", "-")}
+UPRIGHT = 0.6  # least cosine between the figure, on average over the frames, and the axis that is up
+STRAIGHT = 40.0  # degrees, by which trunk and legs of a rest pose may be off the vertical
+BENT = 0.15  # least sine of the angle of a knee or elbow that shows its hinge
+
+
+class Figure(NamedTuple):
+    """Positions [T, n, 3] and world rotations [T, n, 3, 3] of joints."""
+
+    positions: np.ndarray
+    rotations: np.ndarray
+
+    def turned(self, turn: np.ndarray) -> "Figure":
+        """Return the figure in other world axes, given as a rotation [3, 3]."""
+        return Figure(self.positions @ turn.T, turn @ self.rotations)
+
+    def bone(self, start: int, end: int) -> np.ndarray:
+        """Return the directions [T, 3] from one joint to another."""
+        return unit(self.positions[:, end] - self.positions[:, start])
+
+
+def figure(parents: np.ndarray, offsets: np.ndarray, rotations: np.ndarray, translation: np.ndarray) -> Figure:
+    """Return where joints are: forward kinematics of offsets [n, 3], rotations [T, n, 3, 3] and a path [T, 3]."""
+    positions, world = np.zeros(rotations.shape[:3]), rotations.copy()
+    for j, parent in enumerate(parents):
+        if parent < 0:
+            positions[:, j] = translation
+        else:
+            world[:, j] = world[:, parent] @ rotations[:, j]
+            positions[:, j] = positions[:, parent] + world[:, parent] @ offsets[j]
+    return Figure(positions, world)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return the directions of vectors [..., 3]; zero for those without length."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), 0.0)
+
+
+def upright(body: Figure, parts: Parts) -> np.ndarray:
+    """Return the mean direction [3] from the feet to the head, at most of length 1."""
+    feet = 0.5 * sum(body.positions[:, parts.limbs[f"{side} foot"]] for side in SIDES)
+    return unit(body.positions[:, parts.chain[-1]] - feet).mean(axis=0)
+
+
+def turn_upright(up: np.ndarray, forward: np.ndarray | None = None) -> np.ndarray:
+    """Return the rotation [3, 3] that makes an axis of the file +y, and another, if given, +z."""
+    if forward is not None:
+        return np.stack([np.cross(up, forward), up, forward])
+    about = np.cross(up, [0.0, 1.0, 0.0])
+    if np.linalg.norm(about) < 1e-9:
+        return np.eye(3) if up[1] > 0 else np.diag([1.0, -1.0, -1.0])
+    return Rotation.from_rotvec(0.5 * np.pi * about).as_matrix()
+
+
+def up_axis(moving: Figure, resting: Figure, parts: Parts) -> str | None:
+    """Return the axis of a file that points up, such as `z`; None if the frames do not say.
+
+    A figure that crawls or lies is not upright; then the rest pose says it, if it is one.
+    """
+    mean = upright(moving, parts)
+    name = max(AXES, key=lambda axis: float(mean @ AXES[axis]))
+    rest = is_rest_pose(resting, parts)
+    if (rest is not None and mean @ AXES[rest] > 0.3) or mean @ AXES[name] < UPRIGHT:
+        return rest
+    return name
+
+
+def is_rest_pose(resting: Figure, parts: Parts) -> str | None:
+    """Return the axis that points up in a pose [1, n] in which a figure stands with arms apart; None if it does not."""
+    at = resting.positions[0]
+    trunk = unit(at[parts.chain[-1]] - at[parts.hips])
+    name = max(AXES, key=lambda axis: float(trunk @ AXES[axis]))
+    up, limit = AXES[name], np.cos(np.radians(STRAIGHT))
+    across = unit(at[parts.limbs["left thigh"]] - at[parts.limbs["right thigh"]])
+    good = [trunk @ up > limit, abs(across @ up) < 0.3]
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        leg = unit(at[parts.limbs[f"{side} foot"]] - at[parts.limbs[f"{side} thigh"]])
+        good.append(-leg @ up > limit)
+        if f"{side} forearm" in parts.limbs:
+            arm = unit(at[parts.limbs[f"{side} forearm"]] - at[parts.limbs[f"{side} upper arm"]])
+            good += [sign * (arm @ across) > 0.15, abs(arm @ np.cross(across, up)) < 0.7]
+    return name if all(good) else None
+
+
+def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts) -> np.ndarray:
+    """Return world rotations [n, 3, 3] of the joints of a figure in a T-pose, facing +z, from its frames.
+
+    The trunk is straight where its joints are not turned. Arms point sideways, legs down. Knees and elbows say how they
+    are turned about that: they bend one way only. Any other joint is turned on its parent as on average.
+
+    Args:
+        shown: all frames, +y up.
+        resting: the pose without any rotation, of which the offsets between joints are used.
+        parents: [n].
+        parts: of the figure.
+    """
+    at, limbs = resting.positions[0], parts.limbs
+    trunk = basis(at[parts.chain[-1]] - at[parts.hips], at[limbs["left thigh"]] - at[limbs["right thigh"]])
+    turned = {joint: basis(np.array([0.0, 1, 0]), np.array([1.0, 0, 0])) @ trunk.T for joint in parts.chain}
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        arm = [limbs.get(f"{side} {part}") for part in ("upper arm", "forearm", "hand")]
+        turned |= _limb(shown, arm, np.array([sign, 0, 0]), np.array([0, -sign, 0]))
+        leg = [limbs.get(f"{side} {part}") for part in ("thigh", "shin", "foot")]
+        turned |= _limb(shown, leg, np.array([0, -1.0, 0]), np.array([1.0, 0, 0]))
+    result = np.tile(np.eye(3), (len(parents), 1, 1))
+    for j, parent in enumerate(parents):
+        if j in turned:
+            result[j] = turned[j]
+        elif parent >= 0:
+            on_parent = np.swapaxes(shown.rotations[:, parent], -1, -2) @ shown.rotations[:, j]
+            result[j] = result[parent] @ Rotation.from_matrix(on_parent).mean().as_matrix()
+    return result
+
+
+def _limb(shown: Figure, joints: list[int | None], along: np.ndarray, hinge: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the world rotations of a limb's first two joints in a T-pose, if its hinge is seen.
+
+    Args:
+        joints: where it begins, its knee or elbow, and where it ends.
+        along, hinge: [3] of the limb in a T-pose; it bends about the hinge.
+    """
+    if None in joints:
+        return {}
+    start, middle, end = (joint for joint in joints if joint is not None)
+    bones = {start: shown.bone(start, middle), middle: shown.bone(middle, end)}
+    axis = np.cross(bones[start], bones[middle])
+    if np.linalg.norm(axis, axis=1).max() < BENT:
+        return {}
+    turned = {}
+    for joint, bone in bones.items():
+        own = np.swapaxes(shown.rotations[:, joint], -1, -2)
+        local = [np.einsum("tab,tb->a", own, vectors) for vectors in (bone, axis)]
+        turned[joint] = basis(along, hinge) @ basis(*local).T
+    return turned
+
+
+def basis(along: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] whose columns are a direction, the part of another across it, and both's product."""
+    along = unit(along)
+    across = unit(across - (across @ along) * along)
+    return np.stack([along, across, np.cross(along, across)], axis=1)

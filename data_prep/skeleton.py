@@ -1,0 +1,202 @@
+"""Which joint of a skeleton is which part of a body: by whole naming schemes, and by who hangs on whom.
+
+Known are the names of CMU, Mixamo, LaFAN1, Rokoko, Xsens, 100STYLE, Bandai-Namco, SMPL, Daz, Unreal and MetaHuman, VRM,
+Rigify and 3ds Max Biped, with any prefix that all joints share. Arms and legs may follow two schemes. For other names
+there is a mapping file (`mapped`).
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+SIDES = ("left", "right")
+ARM, LEG = ("clavicle", "upper arm", "forearm", "hand"), ("thigh", "shin", "foot", "toe")
+NEEDED = ("upper arm", "forearm", "thigh", "shin", "foot")  # of either side; and hips, neck or head
+ARMS = (  # names of ARM by scheme, without side and separators
+    ("shoulder", "arm", "forearm", "hand"),
+    ("collar", "shoulder", "elbow", "wrist"),
+    ("collar", "shldr", "forearm", "hand"),
+    ("clavicle", "upperarm", "lowerarm", "hand"),
+    ("shoulder", "upperarm", "lowerarm", "hand"),
+    ("shoulder", "upperarm", "forearm", "hand"),
+    ("clavicle", "upperarm", "forearm", "hand"),
+    ("collar", "uparm", "lowarm", "hand"),
+)
+LEGS = (  # with what a toe is called
+    ("upleg", "leg", "foot", "toebase|toe"),
+    ("hip", "knee", "ankle", "toe|toebase|foot"),
+    ("thigh", "shin", "foot", "toe"),
+    ("thigh", "calf", "foot", "ball|toe0|toe"),
+    ("upperleg", "lowerleg", "foot", "toes|toe|toebase"),
+    ("upleg", "lowleg", "foot", "toe"),
+)
+
+
+class Parts(NamedTuple):
+    """The joints of a body's parts, by their numbers."""
+
+    hips: int
+    spine: tuple[int, ...]  # above the hips; the last carries the arms
+    neck: tuple[int, ...]  # above the spine, to the head
+    limbs: dict[str, int]  # by side and part, such as "left upper arm"
+
+    @property
+    def chain(self) -> tuple[int, ...]:
+        """Joints from the hips to the head."""
+        return (self.hips, *self.spine, *self.neck)
+
+    def named(self, names: tuple[str, ...]) -> dict[str, str]:
+        """Return the names of the joints by part, as `mapped` takes them."""
+        chains = {"spine": self.spine, "neck": self.neck}
+        rows = {f"{part} {i + 1}": names[joint] for part, chain in chains.items() for i, joint in enumerate(chain)}
+        return {"hips": names[self.hips]} | rows | {part: names[joint] for part, joint in self.limbs.items()}
+
+
+def find(names: tuple[str, ...], parents: np.ndarray, about: str = "the skeleton", allow: bool = False) -> Parts:
+    """Find the parts of a body by the names of its joints.
+
+    Args:
+        names: of the joints.
+        parents: [n] of the joints, -1 for the root; parents come first.
+        about: what the skeleton is of, for messages.
+        allow: take a skeleton without arms or head.
+
+    Raises:
+        ValueError: that names all parts that are not found, with all joints.
+    """
+    sided = {}
+    for joint, (side, core) in enumerate(map(_split, _without_prefix(names))):
+        sided.setdefault((side, core), joint)
+    limbs = _limbs(sided, parents, ARM, ARMS) | _limbs(sided, parents, LEG, LEGS)
+    return _whole(names, parents, limbs, sided, about, allow)
+
+
+def mapped(names: tuple[str, ...], parents: np.ndarray, path: Path, allow: bool = False) -> Parts:
+    """Read the parts of a body from a mapping file, YAML of `part: joint`: `left upper arm: Bone.012`.
+
+    Raises:
+        ValueError: naming the file, for what is not a part, not a joint, or missing.
+    """
+    try:
+        rows = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: not a mapping of joints ({error})") from error
+    known = [f"{side} {part}" for side in SIDES for part in (*ARM, *LEG)]
+    if not isinstance(rows, dict):
+        raise ValueError(f"{path}: expected lines such as 'left upper arm: JOINT'")
+    rows = {str(part): str(joint) for part, joint in rows.items() if joint}
+    unknown = sorted(set(rows) - {"hips", "chest", "neck", "head", *known})
+    absent = sorted(set(rows.values()) - set(names))
+    if unknown:
+        there = ", ".join(("hips", "chest", "neck", "head", *known))
+        raise ValueError(f"{path}: no parts: {', '.join(unknown)}; there are {there}")
+    if absent:
+        raise ValueError(f"{path}: no joints of the recording: {', '.join(absent)}; it has {', '.join(names)}")
+    limbs = {part: names.index(rows[part]) for part in known if part in rows}
+    central = {("", part): names.index(rows[part]) for part in ("hips", "chest", "neck", "head") if part in rows}
+    return _whole(names, parents, limbs, central, str(path), allow)
+
+
+def guess(names: tuple[str, ...], parents: np.ndarray) -> str:
+    """Return the text of a mapping file, with the parts that are found and an empty line for each other."""
+    sided = {}
+    for joint, (side, core) in enumerate(map(_split, _without_prefix(names))):
+        sided.setdefault((side, core), joint)
+    limbs = _limbs(sided, parents, ARM, ARMS) | _limbs(sided, parents, LEG, LEGS)
+    rows = {part: sided.get(("", part)) for part in ("hips", "chest", "neck", "head")}
+    rows |= {f"{side} {part}": limbs.get(f"{side} {part}") for side in SIDES for part in (*ARM, *LEG)}
+    lines = [f"{part}: {'' if joint is None else names[joint]}".rstrip() for part, joint in rows.items()]
+    return "\n".join([f"# joints of the file: {', '.join(names)}", *lines, ""])
+
+
+def ancestors(joint: int, parents: np.ndarray) -> list[int]:
+    """Return a joint and all joints that it hangs on, up to the root."""
+    chain = [joint]
+    while parents[chain[-1]] >= 0:
+        chain.append(int(parents[chain[-1]]))
+    return chain
+
+
+def _without_prefix(names: tuple[str, ...]) -> list[str]:
+    """Return names without a namespace, and without a prefix that ends in a separator and that nearly all share."""
+    plain = [name.rpartition(":")[2] or name for name in names]
+    starts = [re.match(r"^[A-Za-z0-9]+?[_ ]", name) for name in plain]
+    counted = [match.group() for match in starts if match]
+    for prefix in set(counted):
+        side = prefix[:-1].lower() in ("l", "r", *SIDES)
+        if not side and counted.count(prefix) > 0.5 * len(plain):
+            return _without_prefix(tuple(name.removeprefix(prefix) or name for name in plain))  # such as J_Bip_
+    return plain
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return the side, `left`, `right` or nothing, and the rest of a name in small letters without separators."""
+    words = [word for word in re.split(r"[^A-Za-z0-9]+", name) if word]
+    side = ""
+    for k, word in enumerate(words):
+        if word.lower() in ("l", "r", *SIDES):
+            side = "left" if word.lower() in ("l", "left") else "right"
+            words = words[:k] + words[k + 1 :]
+            break
+    core = "".join(words)
+    if not side:
+        match = re.match(r"^(left|right)(.+)$", core, re.IGNORECASE) or re.match(r"^(l|r)([A-Z].*)$", core)
+        match = match or re.match(r"^(.+?)(left|right|L|R)$", core)
+        if match:
+            one, other = match.groups()
+            letters, core = (one, other) if one.lower() in ("l", "r", *SIDES) else (other, one)
+            side = "left" if letters.lower().startswith("l") else "right"
+    core = core.lower()
+    words = [word.lower() for word in words if word.lower() not in ("c", "def", "org", "bip01", "bip001")]
+    return side, "".join(words) if not side and words else core.removeprefix("def").removeprefix("bip01")
+
+
+def _limbs(sided: dict, parents: np.ndarray, parts: tuple[str, ...], schemes: tuple) -> dict[str, int]:
+    """Return the joints of the limbs of the scheme that names most of them, each hanging on the one before."""
+    best: dict[str, int] = {}
+    for scheme in schemes:
+        found = {}
+        for side in SIDES:
+            joints = {
+                part: next((sided[side, core] for core in cores.split("|") if (side, core) in sided), None)
+                for part, cores in zip(parts, scheme, strict=True)
+            }
+            present = [(part, joint) for part, joint in joints.items() if joint is not None]
+            hangs = all(a[1] in ancestors(b[1], parents)[1:] for a, b in zip(present, present[1:], strict=False))
+            needed = all(joints[part] is not None for part in parts if part in NEEDED)
+            if hangs and needed:
+                found |= {f"{side} {part}": joint for part, joint in present}
+        if len(found) > len(best):
+            best = found
+    return best
+
+
+def _whole(names: tuple[str, ...], parents: np.ndarray, limbs: dict, central: dict, about: str, allow: bool) -> Parts:
+    """Complete the parts: the hips carry both legs, the chest both arms; the spine lies between, the neck above."""
+    missing = [f"{side} {part}" for side in SIDES for part in NEEDED if f"{side} {part}" not in limbs]
+    head = next((central["", core] for core in ("head", "neck", "neck01") if ("", core) in central), None)
+    if head is None:
+        missing.append("head")
+    if missing and not (allow and not {f"{side} {part}" for side in SIDES for part in LEG[:3]} & set(missing)):
+        raise ValueError(
+            f"{about}: no joint is known as {', '.join(missing)} among {', '.join(names)}: "
+            "rename them, or name them in a file (--joints map.yaml)"
+        )
+    left, right = (ancestors(limbs[f"{side} thigh"], parents)[1:] for side in SIDES)
+    shared = [joint for joint in left if joint in right]
+    if not shared:
+        raise ValueError(f"{about}: the legs do not hang on one joint")
+    hips = central.get(("", "hips"))
+    hips = hips if hips in shared else shared[0]
+    carriers = [ancestors(limbs[f"{side} upper arm"], parents)[1:] for side in SIDES if f"{side} upper arm" in limbs]
+    carriers += [ancestors(head, parents)[1:]] if len(carriers) < 2 and head is not None else []
+    carriers = carriers or [[hips]]
+    chest = next((joint for joint in carriers[0] if all(joint in other for other in carriers)), hips)
+    spine = ancestors(chest, parents)
+    spine = spine[: spine.index(hips)] if hips in spine else []
+    neck = [] if head is None else ancestors(head, parents)
+    below = next((k for k, joint in enumerate(neck) if joint in (*spine, *ancestors(hips, parents))), len(neck))
+    return Parts(hips, tuple(spine[::-1]), tuple(neck[:below][::-1]), limbs)
