@@ -1,13 +1,14 @@
 """Bodies of the SMPL family (SMPL, SMPL-H, SMPL-X), from the files that their authors publish.
 
     python -m data_prep.smpl SMPL_FEMALE.pkl body.h5
-    python -m data_prep.smpl SMPLX_NEUTRAL.npz body.h5 --shapes 16
+    python -m data_prep.smpl SMPLX_NEUTRAL.npz body.h5 --shapes 10
 
 The files do not come with clothjax: register at smpl.is.tue.mpg.de, and mind their licence. A .pkl is read without
 chumpy, and no code in it is run: only arrays, numbers and texts are allowed.
 """
 
 import codecs
+import collections
 import copyreg
 import pickle
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ NAMES = {
     52: (*BODY, *FINGERS),
     55: (*BODY, "jaw", "left_eye", "right_eye", *FINGERS),
 }
+EXPRESSIVE = {20: 10, 400: 300}  # shape parameters of SMPL-X among its columns; expressions follow
 KEYS = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table")
 
 
@@ -50,8 +52,20 @@ class _Chumpy(_Placeholder):
     """Placeholder for a chumpy array."""
 
 
-class _Sparse(_Placeholder):
-    """Placeholder for a sparse matrix of scipy."""
+class _Columns(_Placeholder):
+    """Placeholder for a sparse matrix of scipy in compressed columns."""
+
+
+class _Rows(_Placeholder):
+    """Placeholder for a sparse matrix of scipy in compressed rows."""
+
+
+SPARSE = {_Columns: scipy.sparse.csc_matrix, _Rows: scipy.sparse.csr_matrix}
+
+
+def _from_buffer(buffer: bytes, dtype: np.dtype, shape: tuple[int, ...], order: str) -> np.ndarray:
+    """Return an array as pickle's protocol 5 holds it."""
+    return np.frombuffer(buffer, dtype).reshape(shape, order=order)
 
 
 # classes and functions that the published files ask for, by their names of then and of now
@@ -62,8 +76,9 @@ ALLOWED = {
     "numpy._core.multiarray._reconstruct": np._core.multiarray._reconstruct,
     "numpy.core.multiarray.scalar": np._core.multiarray.scalar,
     "numpy._core.multiarray.scalar": np._core.multiarray.scalar,
-    "scipy.sparse.csc.csc_matrix": _Sparse,
-    "scipy.sparse._csc.csc_matrix": _Sparse,
+    "numpy.core.numeric._frombuffer": _from_buffer,
+    "numpy._core.numeric._frombuffer": _from_buffer,
+    "collections.OrderedDict": collections.OrderedDict,
     "chumpy.ch.Ch": _Chumpy,
     "_codecs.encode": codecs.encode,
     "copy_reg._reconstructor": copyreg._reconstructor,
@@ -71,6 +86,10 @@ ALLOWED = {
     "__builtin__.object": object,
     "builtins.object": object,
 }
+for _kind, _class in (("csc", _Columns), ("csr", _Rows)):
+    ALLOWED |= {
+        f"scipy.sparse.{at}.{_kind}_{what}": _class for at in (_kind, f"_{_kind}") for what in ("matrix", "array")
+    }
 
 
 class _Unpickler(pickle.Unpickler):
@@ -78,7 +97,9 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str):
         if f"{module}.{name}" not in ALLOWED:
-            raise ValueError(f"it asks for {module}.{name}, which no body model needs: do not trust it")
+            raise ValueError(
+                f"it asks for {module}.{name}, which none of the published body models needs: do not trust it, or save it anew with plain arrays"
+            )
         return ALLOWED[f"{module}.{name}"]
 
 
@@ -111,10 +132,10 @@ def _array(value) -> np.ndarray:
     """Return the dense array of a value that was unpickled."""
     if isinstance(value, _Chumpy):
         value = value.state["x"]
-    if isinstance(value, _Sparse):
+    if type(value) in SPARSE:
         state = value.state
         shape = state["_shape"] if "_shape" in state else state["shape"]
-        value = scipy.sparse.csc_matrix((state["data"], state["indices"], state["indptr"]), shape)
+        value = SPARSE[type(value)]((state["data"], state["indices"], state["indptr"]), shape)
         value.check_format(full_check=True)  # toarray would write out of bounds for a wrong index
         value = value.toarray()
     return np.asarray(value)
@@ -160,8 +181,11 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
         raise ValueError(f"{path}: has {joints} joints; those of {', '.join(map(str, NAMES))} are known")
     regressor = floats("J_regressor", joints, count)
     shapedirs = floats("shapedirs", count, 3, None)
-    if not 1 <= shapes <= shapedirs.shape[-1]:
-        raise ValueError(f"{path}: has {shapedirs.shape[-1]} shape parameters; --shapes {shapes} is out of range")
+    columns = shapedirs.shape[-1]
+    own = EXPRESSIVE.get(columns, columns) if joints == len(NAMES[55]) else columns
+    if not 1 <= shapes <= own:
+        others = f" (the other {columns - own} are of expressions)" if own < columns else ""
+        raise ValueError(f"{path}: has {own} shape parameters{others}; --shapes {shapes} is out of range")
     shapedirs = shapedirs[..., :shapes]
     parents = floats("kintree_table", 2, joints)[0].astype(np.int64)
     parents[0] = -1
