@@ -87,9 +87,8 @@ ALLOWED = {
     "builtins.object": object,
 }
 for _kind, _class in (("csc", _Columns), ("csr", _Rows)):
-    ALLOWED |= {
-        f"scipy.sparse.{at}.{_kind}_{what}": _class for at in (_kind, f"_{_kind}") for what in ("matrix", "array")
-    }
+    for _at in (f"scipy.sparse.{_kind}.{_kind}", f"scipy.sparse._{_kind}.{_kind}"):
+        ALLOWED |= {f"{_at}_matrix": _class, f"{_at}_array": _class}
 
 
 class _Unpickler(pickle.Unpickler):
@@ -98,7 +97,8 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str):
         if f"{module}.{name}" not in ALLOWED:
             raise ValueError(
-                f"it asks for {module}.{name}, which none of the published body models needs: do not trust it, or save it anew with plain arrays"
+                f"it asks for {module}.{name}, which none of the published body models needs: do not trust it, "
+                "or save it anew with plain arrays"
             )
         return ALLOWED[f"{module}.{name}"]
 
