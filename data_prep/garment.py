@@ -275,8 +275,18 @@ class Arguments:
     up: Up = "y"
     """Axis of the mesh that points up."""
     pin: str = "none"
-    """Part of the mesh that is pinned to the body: `none`, its `highest` opening, vertices painted `red`, or
-    `object:NAME`."""
+    """Part of the mesh that is pinned to the body: `none`, its `highest` opening, borders `above:HEIGHT` in m, vertices
+    painted `red`, or `object:NAME`."""
+    object: tuple[str, ...] = ()
+    """Objects, groups or materials of the file that are the garment; default: all."""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Metres by which the mesh is moved onto the body: to the left, up and forward."""
+    turn: float = 0.0
+    """Degrees by which the mesh is turned about the vertical before."""
+    sew: float = 0.1
+    """Millimetres between borders that are one seam."""
+    allow: bool = False
+    """Take a mesh that must be pushed far out of the body."""
     loose: bool | None = None
     """Treat the mesh as hanging loosely, as skirts do; default: by its distance to the body."""
     flip: bool = False
@@ -301,7 +311,10 @@ def main(args: Arguments) -> None:
         raise ValueError("give either --template or --mesh")
     if args.vertices is not None and not MIN_VERTICES <= args.vertices <= MAX_VERTICES:
         raise ValueError(f"--vertices {args.vertices}: {MIN_VERTICES} to {MAX_VERTICES} can be trained")
-    answers = Answers(args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth)
+    answers = Answers(
+        args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth, args.object,
+        args.shift, args.turn, args.sew, args.allow,
+    )  # fmt: skip
     allowed = Answers(vertices=args.vertices, seed=args.seed)
     of_mesh = [name for name in Answers._fields if getattr(answers, name) != getattr(allowed, name)]
     if args.mesh is None and of_mesh:
