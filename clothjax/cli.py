@@ -103,9 +103,10 @@ def run(main: Callable[[list[str]], None]) -> None:
 
 
 def setup() -> None:
-    """Store compiled programs between runs, in `.jax_cache` or the folder JAX_COMPILATION_CACHE_DIR."""
+    """Compute in float32, and store compiled programs in `.jax_cache` or the folder JAX_COMPILATION_CACHE_DIR."""
     import jax
 
+    jax.config.update("jax_enable_x64", False)  # the environment may say otherwise, JAX_ENABLE_X64
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         jax.config.update("jax_compilation_cache_dir", str(Path(".jax_cache").absolute()))
 

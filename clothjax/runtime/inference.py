@@ -36,7 +36,7 @@ def initial_state(model: Model, pose: Pose) -> State:
     is not finite.
     """
     pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
-    still = Pose(jnp.broadcast_to(jnp.eye(3)[None], pose.rotations.shape), jnp.zeros(3))
+    still = Pose(jnp.broadcast_to(jnp.eye(3, dtype=jnp.float32)[None], pose.rotations.shape), jnp.zeros(3, jnp.float32))
     pose, ok = _sound_or(pose, still)
     rotation, places = skinning.forward_kinematics(pose.rotations, model.wearer.joints, np.array(model.parents))
     rotations, positions, translation = (jnp.stack([x, x]) for x in (pose.rotations, places, pose.translation))
@@ -83,6 +83,7 @@ def _advanced(
 ) -> tuple[State, Array | None]:
     """Compute the next frame as `step` does, which is compiled apart."""
     network, wearer, parents = model.network, model.wearer, np.array(model.parents)
+    pose = Pose(jnp.asarray(pose.rotations, jnp.float32), jnp.asarray(pose.translation, jnp.float32))
     pose, sound = _sound_or(pose, Pose(state.rotations[0], state.translation[0]))
     if external is not None:
         external = jnp.asarray(external, jnp.float32)

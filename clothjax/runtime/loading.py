@@ -26,6 +26,7 @@ from clothjax.runtime.models import (
     Network,
     PosePredictor,
     Wearer,
+    in_float32,
 )
 from clothjax.types import Array, Body, Garment, Material, Mesh
 
@@ -73,7 +74,7 @@ def build(
     network, wearer = _arrays(
         garment, body, touched, mesh, garment_params, predictor, normalizers, betas, material, config
     )
-    return Model(
+    model = Model(
         network=network,
         wearer=wearer,
         faces=jnp.asarray(garment.faces),
@@ -83,6 +84,7 @@ def build(
         moving=tuple(range(len(names))),
         config=config,
     )
+    return in_float32(model)
 
 
 def _touched(garment: Garment, body: Body, candidates: Array, config: Config) -> tuple[Body, np.ndarray]:

@@ -154,6 +154,11 @@ class Model:
     config: Config
 
 
+def in_float32(model: Model) -> Model:
+    """Return a model whose numbers are float32, also in a process with `jax_enable_x64`."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32) if x.dtype == "float64" else x, model)
+
+
 class Drape(NamedTuple):
     """How the garment hangs and moves, which a Psi with forces feels. Positions are relative to the root's translation.
 

@@ -14,7 +14,17 @@ from clothjax.files import storage
 from clothjax.geometry import proximity
 from clothjax.runtime.drape import blend_weights
 from clothjax.runtime.inference import rollout
-from clothjax.runtime.models import Bounds, Felt, FoldedLayer, ForcePredictor, Layer, Model, Network, PosePredictor
+from clothjax.runtime.models import (
+    Bounds,
+    Felt,
+    FoldedLayer,
+    ForcePredictor,
+    Layer,
+    Model,
+    Network,
+    PosePredictor,
+    in_float32,
+)
 from clothjax.types import Array, Garment, Motion
 
 FOLD_RATIO = 0.75  # folding must leave at most this part of the weights of the layers around the code
@@ -46,7 +56,7 @@ def specialise(model: Model, *, blendshapes: int | None = None, max_influences: 
         model = _fewer_shapes(model, blendshapes)
     if max_influences is not None:
         model = _fewer_influences(model, max_influences)
-    return without_code(_without_idle_joints(model))
+    return in_float32(without_code(_without_idle_joints(model)))
 
 
 def without_code(model: Model) -> Model:
