@@ -97,7 +97,7 @@ def _matrices(poses: np.ndarray, path: str | Path) -> np.ndarray:
             first, *_, last = np.abs(fours).mean(axis=(0, 1))  # that of the angle is largest: most joints turn little
             order = fours[..., [1, 2, 3, 0]] if first > last else fours
             return Rotation.from_quat(order.reshape(-1, 4)).as_matrix().reshape(frames, -1, 3, 3)
-    if (poses.ndim == 3 and poses.shape[2] != 3) or flat.shape[1] < 3 * joints or flat.shape[1] % 3:
+    if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or flat.shape[1] < 3 * joints or flat.shape[1] % 3:
         raise ValueError(
             f"{path}: poses {poses.shape}: expected axis-angle [T, J, 3], quaternions [T, J, 4] or matrices "
             f"[T, J, 3, 3] of at least {joints} joints (6D: which convention it has is not seen; convert it)"

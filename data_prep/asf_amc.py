@@ -187,9 +187,9 @@ class Arguments(SkeletonOptions):
     output: tyro.conf.Positional[Path]
     source_fps: float = 120.0
     """Frames per second of the recording; the file does not say."""
-    abduct: float = 25.0
+    abduct: float = field(default=25.0, kw_only=True)
     """Degrees the upper arms are taken outward: CMU's skeletons hold them about 30 too close to the trunk."""
-    drop_clavicles: float = 15.0
+    drop_clavicles: float = field(default=15.0, kw_only=True)
     """Degrees the clavicles are lowered, for the same reason."""
     licence: str = field(
         default="of the recording; CMU's: free to use with credit, not to be resold (mocap.cs.cmu.edu)", kw_only=True

@@ -66,7 +66,8 @@ def read_bvh(path: str | Path) -> Capture:
             places[:, j, axis] = values[:, k]
         column += len(own)
     # CMU's rate is 120, its files say 0.0083333: without rounding every clip would be interpolated
-    return _below_the_path(cmu_names(tuple(names)), parents, places, rotations, round(1 / duration, 2))
+    plain = cmu_names(tuple(name.rpartition(":")[2] for name in names))  # Mixamo writes mixamorig:Hips
+    return _below_the_path(plain, parents, places, rotations, round(1 / duration, 2))
 
 
 def _below_the_path(

@@ -98,8 +98,9 @@ def is_rest_pose(resting: Figure, parts: Parts) -> str | None:
 def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts) -> np.ndarray:
     """Return world rotations [n, 3, 3] of the joints of a figure in a T-pose, facing +z, from its frames.
 
-    The trunk is straight where its joints are not turned. Arms point sideways, legs down. Knees and elbows say how they
-    are turned about that: they bend one way only. Any other joint is turned on its parent as on average.
+    The trunk is straight: where its joints are not turned, or if it is not so then, as on average. Arms point sideways,
+    legs down. Knees and elbows say how they are turned about that: they bend one way only. Any other joint is turned on
+    its parent as on average.
 
     Args:
         shown: all frames, +y up.
@@ -107,9 +108,7 @@ def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts) 
         parents: [n].
         parts: of the figure.
     """
-    at, limbs = resting.positions[0], parts.limbs
-    trunk = basis(at[parts.chain[-1]] - at[parts.hips], at[limbs["left thigh"]] - at[limbs["right thigh"]])
-    turned = {joint: basis(np.array([0.0, 1, 0]), np.array([1.0, 0, 0])) @ trunk.T for joint in parts.chain}
+    limbs, turned = parts.limbs, _trunk(shown, resting, parts)
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         arm = [limbs.get(f"{side} {part}") for part in ("upper arm", "forearm", "hand")]
         turned |= _limb(shown, arm, np.array([sign, 0, 0]), np.array([0, -sign, 0]))
@@ -123,6 +122,30 @@ def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts) 
             on_parent = np.swapaxes(shown.rotations[:, parent], -1, -2) @ shown.rotations[:, j]
             result[j] = result[parent] @ Rotation.from_matrix(on_parent).mean().as_matrix()
     return result
+
+
+def _trunk(shown: Figure, resting: Figure, parts: Parts) -> dict[int, np.ndarray]:
+    """Return the world rotations of the joints from the hips to the head in a T-pose."""
+    chain, limbs = parts.chain, parts.limbs
+    ends = [limbs.get(f"{side} clavicle", limbs.get(f"{side} upper arm")) for side in SIDES]
+    upright_pose = basis(np.array([0.0, 1, 0]), np.array([1.0, 0, 0]))
+    line = resting.bone(parts.hips, chain[-1])[0]
+    across = resting.bone(limbs["right thigh"], limbs["left thigh"])[0]
+    bones = [resting.bone(a, b)[0] for a, b in zip(chain, chain[1:], strict=False)]
+    straight = all(bone @ line > np.cos(np.radians(STRAIGHT)) for bone in bones) and abs(line @ across) < 0.3
+    if straight and None not in ends:
+        straight = resting.bone(ends[1], ends[0])[0] @ across > np.cos(np.radians(STRAIGHT))
+    if straight:
+        return dict.fromkeys(chain, upright_pose @ basis(line, across).T)
+    hips = shown.bone(limbs["right thigh"], limbs["left thigh"])
+    shoulders = hips if None in ends else shown.bone(ends[1], ends[0])
+    lines, turned = shown.bone(parts.hips, chain[-1]), {}
+    for k, joint in enumerate(chain):
+        share = min(k / max(len(parts.spine), 1), 1.0)
+        own = np.swapaxes(shown.rotations[:, joint], -1, -2)
+        local = [np.einsum("tab,tb->a", own, x) for x in (lines, (1 - share) * hips + share * shoulders)]
+        turned[joint] = upright_pose @ basis(*local).T
+    return turned
 
 
 def _limb(shown: Figure, joints: list[int | None], along: np.ndarray, hinge: np.ndarray) -> dict[int, np.ndarray]:

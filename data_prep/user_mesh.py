@@ -332,11 +332,11 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
     points = working.vertices
     signed = igl.signed_distance(points, *surface, sign_type=WINDING)[0]
     deep_share, deepest = float((signed < -DEEP).mean()), np.round(points[signed.argmin()], 2)
-    if deep_share > MAX_DEEP_SHARE:
+    if deep_share > MAX_DEEP_SHARE and not answers.allow:
         raise ValueError(
             f"{path}: {100 * deep_share:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, "
-            f"at most {-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose; --body "
-            "names the body"
+            f"at most {-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose, or is "
+            f"worn elsewhere. {_better_place(points, surface)}--allow takes it as it is"
         )
     cleared = push_out(points, working.faces, *surface)
     signed = igl.signed_distance(cleared, *surface, sign_type=WINDING)[0]

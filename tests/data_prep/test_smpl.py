@@ -217,7 +217,7 @@ def test_a_recording_that_is_up_in_y_can_be_told(tmp_path):
     [
         ({"poses": None}, "no poses in it"),
         ({"mocap_framerate": None}, "no mocap_framerate in it"),
-        ({"poses": np.zeros((121, 30))}, r"poses \(121, 30\) and trans \(121, 3\)"),
+        ({"poses": np.zeros((121, 30))}, r"poses \(121, 30\): expected axis-angle"),
         ({"trans": np.zeros((120, 3))}, r"trans \(120, 3\)"),
         ({"mocap_framerate": np.array(0.0)}, "not a rate in Hz"),
         (

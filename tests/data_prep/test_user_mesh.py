@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from clothjax.files import storage
 from clothjax.geometry.topology import boundary_mask
@@ -251,3 +252,90 @@ def test_the_program_writes_a_garment_and_its_picture(skirt, body, save, tmp_pat
     garment.main(garment.Arguments(tmp_path / "mine.h5", mesh=path, units="cm", pin="highest"))
     assert storage.load_garment(tmp_path / "mine.h5", body).pinned.sum() > 20
     assert (tmp_path / "mine.garment.png").stat().st_size > 1e4 and "openings" in capsys.readouterr().out
+
+
+def seamed(skirt, fronts=20, backs=20, gap=0.0):
+    """A skirt of two panels, of a front and a back with a number of vertices along their side seams."""
+    vertices, _ = skirt
+    top, low = vertices[:, 1].max(), vertices[:, 1].min()
+    rows = []
+    for start, count in ((0.0, fronts), (np.pi, backs)):
+        around, height = np.meshgrid(np.linspace(start, start + np.pi, 17), np.linspace(top, low, count), indexing="ij")
+        wide = 0.24 + 0.3 * (top - height)
+        side = np.sign(np.sin(start + 1.0)) * 0.5 * gap
+        points = np.stack([wide * np.cos(around), height, 0.8 * wide * np.sin(around) + side], axis=-1)
+        number = np.arange(17 * count).reshape(17, count)
+        a, b, c, d = (
+            number[x, y].reshape(-1) for x in (slice(-1), slice(1, None)) for y in (slice(-1), slice(1, None))
+        )
+        rows.append((points.reshape(-1, 3), np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])))
+    (front, one), (back, other) = rows
+    return np.concatenate([front, back]), np.concatenate([one, other + len(front)])
+
+
+def test_a_seam_whose_sides_have_other_vertices_is_sewn(skirt, body, names, save):
+    made, said = bring(save(*seamed(skirt, 20, 39)), body, names, Answers(pin="highest"))
+    assert any(line.startswith("sewn: 38 vertices that lay on the edge") for line in said)
+    assert made.pinned.sum() == 32 and np.ptp(made.vertices[made.pinned, 1]) < 0.03
+    assert any("1 part, 2 openings" in line for line in said)
+
+
+def test_a_seam_that_is_open_is_refused_or_sewn(skirt, body, names, save):
+    path = save(*seamed(skirt, gap=5e-4))
+    with pytest.raises(ValueError, match=r"two borders run 0\.5 mm beside each other, as at .*--sew 1 sews it"):
+        bring(path, body, names, Answers())
+    made, said = bring(path, body, names, Answers(pin="highest", sew=1.0))
+    assert made.pinned.sum() == 32 and any("1 part, 2 openings" in line for line in said)
+    _, said = bring(path, body, names, Answers(allow=True))
+    assert any("2 parts, 2 openings" in line for line in said)
+
+
+def test_an_open_front_is_pinned_above_a_height(skirt, body, names, save):
+    vertices, faces = seamed(skirt)
+    coat = faces[:, 0] < 17 * 20 - 40  # without a strip along one seam, from top to hem
+    path = save(vertices, faces[coat | (faces[:, 0] >= 17 * 20)])
+    top = vertices[:, 1].max()
+    with pytest.raises(ValueError, match=r"highest border runs from .* as of an open front.*--pin above:"):
+        bring(path, body, names, Answers(pin="highest"))
+    made, _ = bring(path, body, names, Answers(pin=f"above:{top - 0.02}"))
+    assert made.pinned.sum() > 20 and made.vertices[made.pinned, 1].min() > top - 0.03
+    for wrong, told in ((f"above:{top + 1}", "no border is above"), ("above:neck", "give a height in m")):
+        with pytest.raises(ValueError, match=told):
+            bring(path, body, names, Answers(pin=wrong))
+
+
+@pytest.fixture(scope="module")
+def shirt(body):
+    made = storage.load_garment("tshirt_1000", body)
+    return np.asarray(made.vertices, np.float64), np.asarray(made.faces, np.int64)
+
+
+@pytest.mark.parametrize(
+    "turn, shift, flag",
+    [(0, (0, -0.3, 0), "--shift 0.00 0.30 0.00"), (0, (0.1, 0, 0), "--shift -0.10 0.00 0.00"),
+     (90, (0, 0, 0), "--turn 270")],
+)  # fmt: skip
+def test_a_garment_that_is_worn_elsewhere_is_refused_with_the_place(turn, shift, flag, shirt, body, names, save):
+    vertices, faces = shirt
+    moved = vertices @ Rotation.from_euler("y", turn, degrees=True).as_matrix().T + np.array(shift)
+    path = save(moved, faces)
+    with pytest.raises(ValueError, match=rf"{flag}; --allow takes it as it is"):
+        bring(path, body, names, Answers())
+    words = flag.split()
+    answers = Answers(turn=float(words[1])) if "turn" in flag else Answers(shift=tuple(map(float, words[1:])))
+    made, _ = bring(path, body, names, answers)
+    assert nearest(made.vertices, vertices).max() < 1e-3
+
+
+def test_a_file_with_the_body_in_it_asks_for_the_garment(skirt, body, names, tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.Trimesh(*skirt, process=False), geom_name="skirt", node_name="skirt")
+    figure = trimesh.Trimesh(np.asarray(body.vertices), np.asarray(body.faces), process=False)
+    scene.add_geometry(figure, geom_name="Figure", node_name="Figure")
+    scene.export(tmp_path / "dressed.glb")
+    with pytest.raises(ValueError, match=r"object 'Figure' is the body itself.*--object skirt"):
+        bring(tmp_path / "dressed.glb", body, names, Answers())
+    made, _ = bring(tmp_path / "dressed.glb", body, names, Answers(objects=("skirt",)))
+    assert len(made.vertices) == len(skirt[0])
+    with pytest.raises(ValueError, match=r"no object 'hat'; there are"):
+        bring(tmp_path / "dressed.glb", body, names, Answers(objects=("hat",)))

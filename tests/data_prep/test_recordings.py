@@ -1,0 +1,333 @@
+"""Recordings as programs write them: one walk in many dialects comes out as the same walk, or is refused."""
+
+import gzip
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from clothjax.body.plausibility import joint_positions
+from clothjax.files import storage
+from data_prep import amass, bvh, procedural, program, rest_pose, retarget, skeleton
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+CHESTS = {"Spine": "Chest", "Spine1": "Chest2"}
+PELVIS = {"Hips": "pelvis", "Spine": "spine_01", "Spine1": "spine_02", "Neck": "neck_01", "Head": "head"}
+SPINES = {"Hips": "spine", "Spine": "spine.001", "Spine1": "spine.002", "Neck": "neck", "Head": "head"}
+LIMBS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")
+XSENS = dict(zip(LIMBS, ("Collar", "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle", "Toe")))
+UNREAL = dict(zip(LIMBS, ("clavicle", "upperarm", "lowerarm", "hand", "thigh", "calf", "foot", "ball")))
+UNITY = dict(zip(LIMBS, ("Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes")))
+RIGIFY = dict(zip(LIMBS, ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot", "toe")))
+BIPED = dict(zip(LIMBS, ("Clavicle", "UpperArm", "Forearm", "Hand", "Thigh", "Calf", "Foot", "Toe0")))
+
+
+def skeleton_of(name):
+    """A figure in a T-pose, in cm, +y up: (names, parents, offsets), its joints called by `name(side, part)`."""
+    rows = [(name("", part), parent, offset) for part, parent, offset in (
+        ("Hips", -1, (0, 0, 0)), ("Spine", 0, (0, 10, 0)), ("Spine1", 1, (0, 13, 0)), ("Neck", 2, (0, 27, 0)),
+        ("Head", 3, (0, 10, 0)))]  # fmt: skip
+    for side, sign in (("Left", 1), ("Right", -1)):
+        for chain in (
+            (("Shoulder", 2, (3, 22, 0)), ("Arm", 0, (14, 0, 0)), ("ForeArm", 0, (28, 0, 0)), ("Hand", 0, (25, 0, 0))),
+            (("UpLeg", 0, (9, -4, 0)), ("Leg", 0, (0, -42, 0)), ("Foot", 0, (0, -40, 0)), ("ToeBase", 0, (0, -6, 13))),
+        ):
+            for k, (part, parent, (x, y, z)) in enumerate(chain):
+                rows.append((name(side, part), parent if k == 0 else len(rows) - 1, (sign * x, y, z)))
+    names, parents, offsets = zip(*rows)
+    return names, np.array(parents), np.array(offsets, float)
+
+
+def walk(frames=40, fps=30.0):
+    """A walk of that figure: local rotations [T, n, 3, 3] from the T-pose, and a path [T, 3] in cm."""
+    names, _, _ = skeleton_of(lambda side, part: side + part)
+    phase = 2 * np.pi * np.arange(frames) / fps
+    angles = {name: np.zeros((frames, 3)) for name in names}
+    for side, sign in (("Left", 1), ("Right", -1)):
+        swing = np.sin(phase) * sign
+        angles[f"{side}UpLeg"][:, 0] = -30 * swing
+        angles[f"{side}Leg"][:, 0] = 25 + 20 * np.cos(phase) * sign
+        angles[f"{side}Foot"][:, 0] = -8 - 6 * swing
+        angles[f"{side}Arm"] = np.stack([0 * phase, 15 * swing, np.full(frames, -60.0 * sign)], axis=1)
+        angles[f"{side}ForeArm"][:, 1] = -sign * (35 + 15 * swing)
+    angles["Spine"][:, 1], angles["Hips"][:, 1] = 6 * np.sin(phase), 20 - 6 * np.sin(phase)
+    angles["Spine1"][:, 0], angles["Neck"][:, 0] = 4.0, -3.0
+    rotations = np.stack([Rotation.from_euler("zyx", a[:, ::-1], degrees=True).as_matrix() for a in angles.values()], 1)
+    path = np.stack([4 * np.sin(phase), 92 + 2 * np.cos(2 * phase), 110 * np.arange(frames) / fps], axis=1)
+    return rotations, path
+
+
+def write(path, names, parents, offsets, rotations, translation, *, fps=30.0, order="zxy", top="", moving=False):
+    """Write a BVH file; `top` is a joint above the hips, and with `moving` all joints have channels of position."""
+    lines, columns = ["HIERARCHY"], []
+    children = [[c for c, p in enumerate(parents) if p == j] for j in range(len(names))]
+    turning = [f"{axis.upper()}rotation" for axis in order]
+    position = ["Xposition", "Yposition", "Zposition"]
+
+    def joint(j, depth):
+        pad = "  " * depth
+        lines.append(f"{pad}{'ROOT' if parents[j] < 0 and not top else 'JOINT'} {names[j]}")
+        own = (position if parents[j] < 0 or moving else []) + turning
+        shown = np.zeros(3) if moving else offsets[j]
+        lines.extend([f"{pad}{{", f"{pad}  OFFSET {' '.join(f'{x:.6f}' for x in shown)}"])
+        lines.append(f"{pad}  CHANNELS {len(own)} {' '.join(own)}")
+        if parents[j] < 0:
+            columns.append(translation)
+        elif moving:
+            columns.append(np.tile(offsets[j], (len(translation), 1)))
+        with warnings.catch_warnings(action="ignore"):  # at a gimbal lock any of the angles is right
+            columns.append(Rotation.from_matrix(rotations[:, j]).as_euler(order.upper(), degrees=True))
+        for child in children[j]:
+            joint(child, depth + 1)
+        if not children[j]:
+            lines.extend([f"{pad}  End Site", f"{pad}  {{", f"{pad}    OFFSET 0 0 0", f"{pad}  }}"])
+        lines.append(f"{pad}}}")
+
+    if top:
+        lines.extend([f"ROOT {top}", "{", "  OFFSET 0 0 0", f"  CHANNELS 6 {' '.join(position + turning)}"])
+        columns.append(np.zeros((len(translation), 6)))
+    joint(0, int(bool(top)))
+    lines.extend(["}"] if top else [])
+    rows = np.concatenate(columns, axis=1)
+    lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / fps:.7f}"]
+    lines += [" ".join(f"{x:.6f}" for x in row) for row in rows]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def dialect(path, *, turn=None, own=None, name=lambda side, part: side + part, scale=1.0, fps=30.0, **written):
+    """Write the walk in other world axes (a rotation), other axes of each joint (rotations [n, 3, 3]), names, units."""
+    names, parents, offsets = skeleton_of(name)
+    rotations, translation = walk(int(40 * fps / 30), fps)
+    turn = np.eye(3) if turn is None else turn
+    own = np.tile(np.eye(3), (len(names), 1, 1)) if own is None else own
+    rotations[:, 0] = turn @ rotations[:, 0]
+    before = np.where((parents < 0)[:, None, None], np.eye(3), own[np.maximum(parents, 0)])
+    rotations = np.swapaxes(before, -1, -2) @ rotations @ own
+    offsets = np.einsum("nba,nb->na", before, offsets)
+    write(path, names, parents, scale * offsets, rotations, scale * translation @ turn.T, fps=fps, **written)
+    return path
+
+
+def own_axes(random=None):
+    """Axes of joints whose bones lie along their own x; with `random`, any axes at all."""
+    names, parents, offsets = skeleton_of(lambda side, part: side + part)
+    if random is not None:
+        return Rotation.random(len(names), random_state=random).as_matrix()
+    axes = np.tile(np.eye(3), (len(names), 1, 1))
+    for j, name in enumerate(names):
+        children = [c for c, p in enumerate(parents) if p == j]
+        trunk = not name.startswith(("Left", "Right"))
+        end = np.array([0.0, 1, 0]) if trunk else offsets[children[0]] if children else None
+        if end is not None:
+            axes[j] = np.roll(Rotation.align_vectors(end[None], [[0, 0, 1.0]])[0].as_matrix(), 1, axis=1)
+        elif parents[j] >= 0:
+            axes[j] = axes[parents[j]]
+    return axes
+
+
+def retargeted(path, rig, **options):
+    """Joint positions [T, J, 3] m of a file's motion on a body."""
+    capture = bvh.read_bvh(path)
+    motion = retarget.retarget(capture, *rig, about=str(path), **options)
+    return joint_positions(motion, rig.body), motion
+
+
+def beyond(rig):
+    """Fingers and toes, which stay as they are on hands and feet."""
+    return [j for j, name in enumerate(rig.names) if any(part in name for part in ("Finger", "Thumb", "Toe"))]
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return storage.load_rig("body")
+
+
+@pytest.fixture(scope="module")
+def plain(rig, tmp_path_factory):
+    return retargeted(dialect(tmp_path_factory.mktemp("plain") / "walk.bvh"), rig)[0]
+
+
+Z_UP = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+DIALECTS = {
+    "z up": {"turn": Z_UP},
+    "x up": {"turn": Rotation.from_euler("z", -90, degrees=True).as_matrix()},
+    "y down": {"turn": np.diag([1.0, -1, -1])},
+    "metres": {"scale": 0.01},
+    "inches": {"scale": 1 / 2.54},
+    "120 Hz": {"fps": 120.0},
+    "rotations in another order": {"order": "xyz"},
+    "Mixamo": {"name": lambda side, part: f"mixamorig1:{side}{part}"},
+    "Xsens": {"name": lambda side, part: side + (XSENS | CHESTS).get(part, part)},
+    "Unreal": {"name": lambda side, part: f"{UNREAL[part]}_{side[0].lower()}" if side else PELVIS[part]},
+    "Bandai-Namco": {"name": lambda side, part: f"{UNITY[part]}_{side[0]}" if side else part,
+                     "top": "joint_Root", "moving": True},
+    "VRoid": {"name": lambda side, part: f"J_Bip_{side[0]}_{UNITY[part]}" if side else f"J_Bip_C_{part}"},
+    "Rigify": {"name": lambda side, part: f"DEF-{RIGIFY[part]}.{side[0]}" if side else f"DEF-{SPINES[part]}"},
+    "Biped": {"name": lambda side, part: f"Bip01 {side[0]} {BIPED[part]}" if side else f"Bip01 {part}"},
+    "a root above the hips": {"top": "reference", "moving": True},
+    "places without offsets": {"moving": True},
+    "bones along x": {"own": own_axes()},
+    "bones along x, z up": {"own": own_axes(), "turn": Z_UP},
+    "any axes": {"own": own_axes(3)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DIALECTS)
+def test_a_walk_is_the_same_in_every_dialect(kind, plain, rig, tmp_path):
+    found, _ = retargeted(dialect(tmp_path / "walk.bvh", **DIALECTS[kind]), rig)
+    far = np.linalg.norm(found[: len(plain)] - plain, axis=-1)
+    assert np.delete(far, beyond(rig), axis=1).max() < 0.01 and far.max() < 0.02  # m
+    bones = rig.body.parents > 0
+
+    def direction(positions):
+        bone = positions[:, bones] - positions[:, rig.body.parents[bones]]
+        return bone / np.maximum(np.linalg.norm(bone, axis=-1, keepdims=True), 1e-9)
+
+    cosine = np.sum(direction(found[: len(plain)]) * direction(plain), axis=-1)
+    still = np.linalg.norm(direction(plain), axis=-1) < 0.5  # joints at one place
+    assert np.degrees(np.arccos(np.clip(np.where(still, 1.0, cosine), -1, 1))).max() < 3.0 + 3.0 * ("axes" in kind)
+
+
+def test_an_axis_may_be_said(plain, rig, tmp_path):
+    path = dialect(tmp_path / "walk.bvh")
+    found, _ = retargeted(path, rig, axes=retarget.Axes("y", "x"))
+    turned = Rotation.from_euler("y", -90, degrees=True).as_matrix()
+    np.testing.assert_allclose(found - found[:, :1], (plain - plain[:, :1]) @ turned.T, atol=1e-4)
+
+
+def test_a_result_that_differs_from_its_recording_is_refused(rig, tmp_path):
+    path = dialect(tmp_path / "walk.bvh")
+    capture = bvh.read_bvh(path)
+    _, motion = retargeted(path, rig)
+    of_file, of_body = (
+        skeleton.find(*pair) for pair in ((capture.names, capture.parents), (rig.names, rig.body.parents))
+    )
+    shown = rest_pose.figure(capture.parents, capture.offsets, capture.rotations, capture.translation)
+    compared = (motion, rig.body, of_body, shown, of_file, "walk.bvh")
+    retarget.compare(*compared, 0.0)
+    arm = rig.names.index("LeftArm")
+    motion.rotations[:, arm] = motion.rotations[:, arm] @ Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    with pytest.raises(ValueError, match=r"walk\.bvh: the left .*arm would be (2|3)\d degrees off: in frame"):
+        retarget.compare(*compared, 0.0)
+    retarget.compare(*compared, 15.0)  # that was asked for
+
+
+def test_all_that_is_missing_is_told_at_once_and_a_mapping_file_is_begun(rig, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    odd = {"LeftArm": "Bone.012", "RightForeArm": "Bone.044", "Head": "Bone.001"}
+    path = dialect(tmp_path / "walk.bvh", name=lambda side, part: odd.get(side + part, side + part))
+    arguments = bvh.Arguments(motion=path, output=tmp_path / "out.h5")
+    with pytest.raises(ValueError, match=r"walk\.bvh: .*left upper arm.*right forearm.*walk_joints\.yaml") as told:
+        program.retarget_as_asked(bvh.read_bvh(path), rig, arguments, path)
+    assert "Bone.044" in str(told.value)
+    draft = (tmp_path / "walk_joints.yaml").read_text()
+    assert "left upper arm:\n" in draft and "left forearm" in draft
+    filled = tmp_path / "map.yaml"
+    names, parents, _ = skeleton_of(lambda side, part: odd.get(side + part, side + part))
+    rows = skeleton.find(*skeleton_of(lambda side, part: side + part)[:2]).limbs
+    filled.write_text("\n".join(f"{part}: {names[joint]}" for part, joint in rows.items()) + "\nhead: Bone.001\n")
+    assert skeleton.mapped(names, parents, filled).limbs == rows
+    filled.write_text("left wing: Bone.012\n")
+    with pytest.raises(ValueError, match=r"map\.yaml: no parts: left wing"):
+        skeleton.mapped(names, parents, filled)
+    filled.write_text("head: Bone.999\n")
+    with pytest.raises(ValueError, match=r"map\.yaml: no joints of the recording: Bone\.999"):
+        skeleton.mapped(names, parents, filled)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+def test_byte_order_marks(encoding, plain, rig, tmp_path):
+    path = dialect(tmp_path / "walk.bvh")
+    text = path.read_text()
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    path.write_bytes((mark + text).encode(encoding))
+    np.testing.assert_allclose(retargeted(path, rig)[0], plain, atol=1e-6)
+    packed = tmp_path / "walk.bvh.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    np.testing.assert_allclose(retargeted(packed, rig)[0], plain, atol=1e-6)
+
+
+@pytest.mark.parametrize("duration", ["33.3333", "1", "0.00001"])
+def test_a_frame_time_in_other_units_is_refused(duration, tmp_path):
+    path = dialect(tmp_path / "walk.bvh")
+    path.write_text(path.read_text().replace(f"Frame Time: {1 / 30:.7f}", f"Frame Time: {duration}"))
+    with pytest.raises(ValueError, match=r"walk\.bvh: a Frame Time of .* it is in seconds"):
+        bvh.read_bvh(path)
+
+
+# AMASS
+
+
+def recording(tmp_path, poses, **arrays):
+    motion = procedural.generate("walk", 0, 2.0)
+    trans = motion.translation[:60] @ Z_UP.T
+    np.savez(tmp_path / "walk.npz", **{"poses": poses, "trans": trans, "mocap_framerate": 30.0} | arrays)
+    return tmp_path / "walk.npz"
+
+
+@pytest.fixture
+def poses():
+    """Axis-angle [T, 22, 3] of a figure that stands upright, z up, and moves."""
+    random, frames = np.random.default_rng(0), 60
+    angles = 0.3 * np.sin(np.arange(frames)[:, None, None] / 9 + random.uniform(0, 6, (22, 3)))
+    angles[:, 0] = (Rotation.from_matrix(Z_UP) * Rotation.from_rotvec(angles[:, 0])).as_rotvec()
+    return angles
+
+
+@pytest.mark.parametrize("kind", ["flat", "quaternions", "quaternions, angle last", "matrices"])
+def test_poses_are_told_apart_by_shape_and_norm(kind, poses, tmp_path):
+    turns = Rotation.from_rotvec(poses.reshape(-1, 3))
+    last = turns.as_quat().reshape(60, 22, 4)
+    other = {
+        "flat": poses.reshape(60, -1),
+        "quaternions": last[..., [3, 0, 1, 2]],
+        "quaternions, angle last": last.reshape(60, -1),
+        "matrices": turns.as_matrix().reshape(60, 22, 3, 3),
+    }[kind]
+    wanted = amass.read_amass(recording(tmp_path, poses))
+    found = amass.read_amass(recording(tmp_path, other))
+    np.testing.assert_allclose(found.rotations, wanted.rotations, atol=1e-6)
+    np.testing.assert_allclose(wanted.rotations[:, 0, 1, 1], 1.0, atol=0.3)  # it stands
+
+
+def test_a_file_with_y_up_shows_it(poses, tmp_path):
+    wanted = amass.read_amass(recording(tmp_path, poses))
+    turned = poses.copy()
+    turned[:, 0] = (Rotation.from_matrix(Z_UP.T) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    motion = procedural.generate("walk", 0, 2.0)
+    found = amass.read_amass(recording(tmp_path, turned, trans=motion.translation[:60]))
+    np.testing.assert_allclose(found.rotations, wanted.rotations, atol=1e-6)
+    np.testing.assert_allclose(found.translation, wanted.translation, atol=1e-6)
+
+
+def test_what_is_no_axis_angle_is_refused(poses, tmp_path):
+    matrices = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(60, 22, 3, 3)
+    for other in (matrices[..., :2].reshape(60, 22, 6), matrices[:, :, :2], 2 * matrices, poses[:, :20]):
+        with pytest.raises(ValueError, match=r"walk\.npz: poses"):
+            amass.read_amass(recording(tmp_path, other))
+
+
+def test_centimetres_are_noticed(poses, tmp_path):
+    wanted = amass.read_amass(recording(tmp_path, poses))
+    path = recording(tmp_path, poses, trans=100 * procedural.generate("walk", 0, 2.0).translation[:60] @ Z_UP.T)
+    with pytest.raises(ValueError, match=r"walk\.npz: trans looks like centimetres.*--units cm"):
+        amass.read_amass(path)
+    found = amass.read_amass(path, units="cm")
+    np.testing.assert_allclose(found.translation, wanted.translation, atol=1e-6)
+
+
+# The cases that were accepted and wrong
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="needs the files in ../shared/cases")
+@pytest.mark.parametrize(
+    "case", ["bones_along_x", "byte_order_mark", "positions_without_offsets", "root_above_hips",
+             "shoulder_is_upper_arm", "z_up"]
+)  # fmt: skip
+def test_the_cases_are_the_plain_walk(case, rig):
+    plain, _ = retargeted(CASES / "plain/walk.bvh", rig)
+    for path in sorted((CASES / f"bvh_{case}").glob("*.bvh")):
+        found, _ = retargeted(path, rig)
+        assert np.delete(np.linalg.norm(found - plain, axis=-1), beyond(rig), axis=1).max() < 0.01, path
