@@ -1,5 +1,6 @@
 """Bodies of the SMPL family and motions of AMASS, written here in the layout that they are published in."""
 
+import collections
 import pickle
 import sys
 import types
@@ -85,6 +86,32 @@ def test_a_pickled_body_becomes_a_body_file(published, model, tmp_path):
     betas = np.linspace(-2, 2, 10).astype(np.float32)
     regressed = model["J_regressor"] @ np.asarray(skinning.shaped_vertices(body, betas), np.float64)
     np.testing.assert_allclose(skinning.shaped_joints(body, betas), regressed, atol=1e-5)
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+@pytest.mark.parametrize("sparse", ["csc_matrix", "csr_matrix", "csc_array", "csr_array"])
+@pytest.mark.parametrize("kind", [dict, collections.OrderedDict])
+def test_a_body_that_was_saved_anew_is_read(protocol, sparse, kind, model, tmp_path):
+    regressor = getattr(scipy.sparse, sparse)(model["J_regressor"])
+    saved = kind(model | {"J_regressor": regressor, "weights": np.asfortranarray(model["weights"])})
+    (tmp_path / "SMPL.pkl").write_bytes(pickle.dumps(saved, protocol=protocol))
+    assert_is(smpl.body(tmp_path / "SMPL.pkl")[0], model)
+
+
+def test_expressions_are_no_shapes(model, tmp_path):
+    """SMPL-X of 2019: ten of shape, then ten of expression."""
+    count, random = len(model["v_template"]), np.random.default_rng(0)
+    table = np.array([np.maximum(np.arange(55) - 1, 0), range(55)])
+    whole = {key: model[key] for key in ("v_template", "f")} | {
+        "weights": random.dirichlet(np.ones(55), count),
+        "J_regressor": random.dirichlet(np.ones(count), 55),
+        "shapedirs": random.normal(size=(count, 3, 20)),
+        "kintree_table": table,
+    }
+    np.savez(tmp_path / "SMPLX.npz", **whole)
+    assert smpl.body(tmp_path / "SMPLX.npz")[0].shapedirs.shape[-1] == 10
+    with pytest.raises(ValueError, match=r"has 10 shape parameters \(the other 10 are of expressions\); --shapes 16"):
+        smpl.body(tmp_path / "SMPLX.npz", shapes=16)
 
 
 def test_an_npz_is_read_like_a_pickle(model, tmp_path):
