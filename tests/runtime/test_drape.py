@@ -197,3 +197,12 @@ def test_a_packed_one_is_the_same_but_for_rounding(forced, motion, tmp_path):
     moved = jnp.linalg.norm(whole.drape.change)
     assert jnp.linalg.norm(found.latent - whole.latent) < 0.2 * moved  # matrices are packed in eight bits
     assert packed.config == forced.experiment.config
+
+
+def test_it_is_in_float32_in_a_process_that_is_not(forced, model, motion):
+    expected, _ = inference.animate(model, motion)
+    with jax.enable_x64(True):
+        again = forced.model(betas=np.linspace(-1, 1, 10))
+        found, _ = inference.animate(again, motion._replace(translation=motion.translation.astype(np.float64)))
+        assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -50,3 +51,14 @@ def test_a_shipped_garment_moves_like_cloth_on_a_body_that_walks(name):
     length, rest = (np.linalg.norm(x[..., edges[:, 0], :] - x[..., edges[:, 1], :], axis=-1)
                     for x in (vertices, np.asarray(template)))  # fmt: skip
     assert np.percentile(np.abs(length / rest - 1), 95) < 0.15
+
+
+def test_a_garment_is_in_float32_in_a_process_that_is_not():
+    name = trained.shipped()[0]
+    clip = cj.load_motion("walk_3")
+    clip = clip._replace(rotations=clip.rotations[:5], translation=clip.translation[:5])
+    expected, _ = cj.animate(cj.load(name), clip)
+    with jax.enable_x64(True):
+        found, _ = cj.animate(cj.specialise(cj.load(name)), clip)
+        assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, atol=1e-4)
