@@ -201,7 +201,7 @@ def test_a_packed_one_is_the_same_but_for_rounding(forced, motion, tmp_path):
 
 def test_it_is_in_float32_in_a_process_that_is_not(forced, model, motion):
     expected, _ = inference.animate(model, motion)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         again = forced.model(betas=np.linspace(-1, 1, 10))
         found, _ = inference.animate(again, motion._replace(translation=motion.translation.astype(np.float64)))
         assert found.dtype == np.float32

@@ -58,7 +58,7 @@ def test_a_garment_is_in_float32_in_a_process_that_is_not():
     clip = cj.load_motion("walk_3")
     clip = clip._replace(rotations=clip.rotations[:5], translation=clip.translation[:5])
     expected, _ = cj.animate(cj.load(name), clip)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         found, _ = cj.animate(cj.specialise(cj.load(name)), clip)
         assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, atol=1e-4)
