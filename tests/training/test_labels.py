@@ -166,6 +166,27 @@ def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finish
     np.testing.assert_array_equal(again.labels.code[::5][on], after.cloth.latent[on])
 
 
+@pytest.mark.slow
+def test_labels_go_on_from_what_psi_lacked_in_the_last_frame(toy, monkeypatch):
+    """A Psi that is followed and holds the code lacks more and more; two steps a frame then catch up."""
+    experiment, clips, _, blank = toy
+    few = dataclasses.replace(experiment.config.labels, descent_steps=2, shares=(1.0,), noise=0.0)
+    config = dataclasses.replace(experiment.config, labels=few)
+    monkeypatch.setattr(labels, "draw_external", lambda *_: jnp.zeros(3))
+    holding = blank._replace(
+        params=jax.tree.map(jnp.zeros_like, blank.params),
+        normalizers=blank.normalizers._replace(output=jnp.ones_like(blank.normalizers.output)),
+    )
+    least = []
+    for share in (0.0, labels.SAME):
+        monkeypatch.setattr(labels, "SAME", share)
+        finished = collected(toy, labels.make_collect(experiment.scene, clips, config), holding).labels
+        np.testing.assert_array_equal(finished.code[::5], finished.code[4::5])  # it holds the code
+        least.append(finished.least.reshape(-1, 5))
+    np.testing.assert_array_equal(least[0][:, 0], least[1][:, 0])  # there is no frame before the first
+    assert (least[1] <= least[0] * (1 + 1e-4)).all() and (least[1][:, 2:] < 0.99 * least[0][:, 2:]).any()
+
+
 def test_an_external_acceleration_moves_free_cloth_as_gravity_would(problem, toy):
     """Without gravity's energy and with an external acceleration of -g, the potential differs by a constant."""
     scene, config, garment, step, _, code = problem
