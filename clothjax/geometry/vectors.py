@@ -35,7 +35,8 @@ def at_corners(points: Float[Array, "V 3"], elements: Int[Array, "N k"]) -> Floa
 
 def corners(points: Float[Array, "N k 3"]) -> list[Vector]:
     """Return the k corners of elements, each a `Vector` of components [N]."""
-    return [tuple(_unstack(corner, 1)) for corner in _unstack(points, 1)]
+    x, y, z = (_unstack(component, 1) for component in _unstack(points, 2))
+    return list(zip(x, y, z, strict=True))
 
 
 def _unstack(array: Array, axis: int) -> list[Array]:
