@@ -15,7 +15,10 @@ Vector = tuple[Array, Array, Array]
 
 def norm(vectors: Array, keepdims: bool = False) -> Array:
     """Return the lengths [...] of vectors [..., 3], or [..., 1] with `keepdims`."""
-    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=keepdims)
+    return _root(jnp.sum(vectors * vectors, axis=-1, keepdims=keepdims))
+
+
+def _root(squared: Array) -> Array:
     zero = squared == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
@@ -68,3 +71,8 @@ def dot(a: Vector, b: Vector) -> Array:
 def cross(a: Vector, b: Vector) -> Vector:
     """Return the cross product of a and b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def length(a: Vector) -> Array:
+    """Return the lengths of a."""
+    return _root(dot(a, a))

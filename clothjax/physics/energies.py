@@ -129,10 +129,8 @@ def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:
     size = jax.lax.stop_gradient(reduce(jnp.maximum, sizes))
     edge, left, right = (times(1.0 / jnp.where(size > 0, size, 1.0), offset) for offset in offsets)
     left, right = cross(edge, left), cross(right, edge)
-    squared = dot(edge, edge)
-    length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
     sine = dot(cross(left, right), edge)
-    cosine = dot(left, right) * length
+    cosine = dot(left, right) * vectors.length(edge)
     # small again where faces are slivers, and arctan2's derivative squares them
     scale = jax.lax.stop_gradient(jnp.maximum(jnp.abs(sine), jnp.abs(cosine)))
     area = jnp.minimum(dot(left, left), dot(right, right))
