@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -22,6 +23,8 @@ READ = (
     "VRMC_vrm",
 )
 GLB = b"glTF"
+TRIANGLES = 4  # the mode of a primitive; strips and fans follow
+MOST = 10_000_000  # entries of an accessor
 
 
 class Part(NamedTuple):
@@ -68,6 +71,8 @@ class Document:
         """Return the numbers of an accessor [n, width], normalised integers as floats, matrices by columns."""
         entry = self.entries("accessors")[index]
         dtype, width, count = np.dtype(DTYPES[entry["componentType"]]), WIDTHS[entry["type"]], entry["count"]
+        if not 0 <= count <= MOST:
+            raise ValueError(f"an accessor of {count} entries")
         values = np.zeros((count, width), dtype)
         if "bufferView" in entry:
             values = self._view(entry["bufferView"], entry.get("byteOffset", 0), dtype, width, count)
@@ -121,7 +126,7 @@ class Document:
     def skin_transforms(self, index: int, places: dict[int, np.ndarray]) -> np.ndarray:
         """Return the matrices [J, 4, 4] of the joints of a skin, from its mesh to the world."""
         skin = self.entries("skins")[index]
-        joints = np.stack([places.get(joint, np.eye(4)) for joint in skin["joints"]])
+        joints = np.stack([places[joint] for joint in skin["joints"]])
         if "inverseBindMatrices" not in skin:
             return joints
         return joints @ self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2).astype(np.float64)
@@ -131,12 +136,7 @@ def local(node: dict[str, Any]) -> np.ndarray:
     """Return the matrix [4, 4] of a node on its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    turn = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
     result = np.eye(4)
     result[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)[None]
     result[:3, 3] = node.get("translation", (0, 0, 0))
@@ -147,7 +147,7 @@ def parts(path: str | Path) -> list[Part]:
     """Read the triangles of all objects of a file.
 
     Raises:
-        ValueError: as `Document`, and for meshes that are not of triangles.
+        ValueError: as `Document`, and for strips and fans of triangles.
     """
     document = Document(path)
     places, found = document.places(), []
@@ -159,8 +159,11 @@ def parts(path: str | Path) -> list[Part]:
         weights = node.get("weights", mesh.get("weights", ()))
         for primitive in mesh["primitives"]:
             attributes = primitive["attributes"]
-            if primitive.get("mode", 4) != 4 or "POSITION" not in attributes:
-                continue
+            mode = primitive.get("mode", TRIANGLES)
+            if mode < TRIANGLES or "POSITION" not in attributes:
+                continue  # points and lines
+            if mode > TRIANGLES:
+                raise ValueError("strips or fans of triangles: export it as triangles")
             vertices = document.accessor(attributes["POSITION"]).astype(np.float64)
             for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
                 if "POSITION" in target:

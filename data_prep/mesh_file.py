@@ -108,12 +108,11 @@ def _absolute(index: str, count: int) -> str:
 
 
 def _of_gltf(path: Path) -> list[_Part]:
+    parts = [part for part in gltf.parts(path) if len(part.faces)]
+    colours = [None if part.colours is None else 255.0 * part.colours for part in parts]
     return [
-        _Part(part.names, part.vertices, part.faces, _is_red(255.0 * part.colours, len(part.vertices)))
-        if part.colours is not None and part.colours.dtype.kind == "f"
-        else _Part(part.names, part.vertices, part.faces, _is_red(part.colours, len(part.vertices)))
-        for part in gltf.parts(path)
-        if len(part.faces)
+        _Part(part.names, part.vertices, part.faces, _is_red(own, len(part.vertices)))
+        for part, own in zip(parts, colours, strict=True)
     ]
 
 

@@ -127,6 +127,25 @@ def test_what_is_compressed_is_refused_by_name(tmp_path):
         mesh_file.read(file.save(tmp_path / "a.glb"))
 
 
+def test_what_would_be_left_out_is_refused(tmp_path):
+    strip, far, huge = File(), File(), File()
+    strip.primitive["mode"] = 5
+    far.json["nodes"][1]["skin"] = 0
+    far.json["skins"] = [{"joints": [2]}]
+    far.json["nodes"].append({"name": "in no scene"})
+    weights = np.tile(np.array([[1.0, 0, 0, 0]], np.float32), (4, 1))
+    joints = far.add(np.zeros((4, 4), np.uint8))
+    far.primitive["attributes"] |= {"JOINTS_0": joints, "WEIGHTS_0": far.add(weights)}
+    huge.accessors[0] = {"componentType": 5126, "type": "VEC3", "count": 10**12}
+    for file, told in (
+        (strip, "as triangles"),
+        (far, "not a mesh that can be read"),
+        (huge, "1000000000000"),
+    ):
+        with pytest.raises(ValueError, match=rf"a\.glb: .*({told})"):
+            mesh_file.read(file.save(tmp_path / "a.glb"))
+
+
 def test_damaged_files_are_refused(tmp_path):
     file = File()
     whole = file.save(tmp_path / "a.glb").read_bytes()
