@@ -7,7 +7,7 @@ from clothjax.config import HANDS
 from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body, Garment
 from data_prep.diffusion import diffuse
-from data_prep.retarget import cmu_names
+from data_prep.skeleton import cmu_names
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
 CLEARANCE = 0.004  # m, between garment and body

@@ -28,11 +28,13 @@ from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
 from data_prep.dressing import ARM, FOREARM, WINDING, clear_vertices, dress, highest_opening, limbs, push_out
 from data_prep.mesh import clip, component
-from data_prep.program import run
+from data_prep.placement import Placement, Up
+from data_prep.program import Unit, run
 from data_prep.remesh import flip, relax, resample
-from data_prep.retarget import cmu_names
-from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, Unit, Up, bring, draw
+from data_prep.skeleton import cmu_names
+from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, bring, draw
 
+OF_MESH = ("units", "up", "pin", "object", "shift", "turn", "sew", "allow", "loose", "flip", "cloth")  # options
 OFFSET = 0.012  # m, from the body to the solid
 CELL = 0.008  # m, spacing of the distance field's grid
 
@@ -286,7 +288,7 @@ class Arguments:
     sew: float = 0.1
     """Millimetres between borders that are one seam."""
     allow: bool = False
-    """Take a mesh that must be pushed far out of the body."""
+    """Take a mesh that must be pushed far out of the body, or has open seams."""
     loose: bool | None = None
     """Treat the mesh as hanging loosely, as skirts do; default: by its distance to the body."""
     flip: bool = False
@@ -312,11 +314,19 @@ def main(args: Arguments) -> None:
     if args.vertices is not None and not MIN_VERTICES <= args.vertices <= MAX_VERTICES:
         raise ValueError(f"--vertices {args.vertices}: {MIN_VERTICES} to {MAX_VERTICES} can be trained")
     answers = Answers(
-        args.units, args.up, args.pin, args.vertices, args.loose, args.flip, args.seed, args.cloth, args.object,
-        args.shift, args.turn, args.sew, args.allow,
-    )  # fmt: skip
-    allowed = Answers(vertices=args.vertices, seed=args.seed)
-    of_mesh = [name for name in Answers._fields if getattr(answers, name) != getattr(allowed, name)]
+        placement=Placement(args.units, args.up, args.shift, args.turn),
+        pin=args.pin,
+        vertices=args.vertices,
+        loose=args.loose,
+        flip=args.flip,
+        seed=args.seed,
+        cloth=args.cloth,
+        objects=args.object,
+        sew=args.sew,
+        allow=args.allow,
+    )
+    plain = Arguments(args.output)
+    of_mesh = [name for name in OF_MESH if getattr(args, name) != getattr(plain, name)]
     if args.mesh is None and of_mesh:
         raise ValueError(f"--{of_mesh[0]} is an option of --mesh: give --mesh")
     body, names = load_rig(args.body)

@@ -5,48 +5,38 @@ names the option that answers it.
 """
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import igl
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import FACTORS
 from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
 from data_prep import mesh_file
-from data_prep.dressing import CLEARANCE, FOREARM, WINDING, dress, limbs, push_out
+from data_prep.dressing import FOREARM, WINDING, dress, limbs, push_out
 from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
+from data_prep.placement import Placement, Surface, better_place, check_objects, check_place
 from data_prep.remesh import resample
+from data_prep.seams import WELD_DISTANCE, check_seams, sewn
 
-Unit = Literal["m", "cm", "mm", "in", "ft"]
-Up = Literal["y", "z"]
-Surface = tuple[np.ndarray, np.ndarray]  # the body's vertices [B, 3] m float64 and faces [F, 3] int64
-UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
-WELD_DISTANCE = 1e-4  # m; closer vertices become one
-MAX_MEAN_DISTANCE = 0.25  # m, from the body, of a garment that is around it
-INSIDE_PENALTY = 10  # weight of the depth inside the body over the distance to it, in comparing units
 LOOSE_DISTANCE = 0.03  # m; a garment with a larger median distance to the body counts as loose
 DEEP, MAX_DEEP_SHARE = 0.03, 0.15  # m inside the body; a larger share of such vertices means another body
 MIN_VERTICES, MAX_VERTICES = 100, 20_000
 DIFFUSION_SAMPLES = 500  # for each vertex of a loose garment
 FARTHEST_PUSH = 0.03  # m, by which a garment that is worn is pushed out of the body at most
-ON_BODY = 0.003  # m, from the body, of an object that is the body
 MOST_OF_HEIGHT = 0.4  # of the garment's, that an opening to pin may take up
-BESIDE, LEAST_BESIDE = 0.002, 0.2  # m between borders that are not sewn, and the share of a border that runs so
 PIN_COLOUR = (0.85, 0.1, 0.1)
 
 
 class Answers(NamedTuple):
     """Answers that only the user knows."""
 
-    units: Unit = "m"
-    up: Up = "y"
+    placement: Placement = Placement()
     pin: str = "none"  # none, highest, above:HEIGHT, red, or object:NAME
     vertices: int | None = None  # wanted; None: the mesh as it is
     loose: bool | None = None  # None: by its distance to the body
@@ -54,10 +44,8 @@ class Answers(NamedTuple):
     seed: int = 0
     cloth: tuple[str, ...] = ()  # WHAT=DENSITY,STRETCHING,BENDING with WHAT red or object:NAME
     objects: tuple[str, ...] = ()  # of the file, that are the garment; none for all
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, by which the mesh is moved onto the body
-    turn: float = 0.0  # degrees, by which it is turned about the vertical before
     sew: float = 0.1  # mm, between borders that are one seam
-    allow: bool = False  # take a mesh that is pushed far
+    allow: bool = False  # take a mesh that is pushed far, or has open seams
 
 
 class Working(NamedTuple):
@@ -91,13 +79,11 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     """
     mesh = _chosen(path, mesh_file.read(path), answers.objects)
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
-    _check_place(path, mesh.vertices, surface, answers)
-    placed = _placed(mesh.vertices, answers)
-    _check_objects(path, mesh, placed, surface)
+    check_place(path, mesh.vertices, surface, answers.placement)
+    placed = answers.placement(mesh.vertices)
+    check_objects(path, mesh, placed, surface)
     working, index = _clean(path, placed, mesh.faces)
-    working = _sewn(working, 1e-3 * answers.sew)
-    if not answers.allow:
-        _check_seams(path, working)
+    working, index = _sew(path, working, index, answers)
     working = _pin_marked(path, working, mesh, index, answers.pin)
     working = _assign_cloth(path, working, mesh, index, answers.cloth)
     working = _orient(path, working, surface, answers.flip)
@@ -126,12 +112,6 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     return dress(vertices, faces, body, hidden, pinned, samples, answers.seed)._replace(cloth=cloth), log
 
 
-def _placed(vertices: np.ndarray, answers: Answers) -> np.ndarray:
-    """Return the vertices [V, 3] of a file in m, +Y up, where the user wants them."""
-    turn = Rotation.from_euler("y", answers.turn, degrees=True).as_matrix()
-    return UNITS[answers.units] * vertices @ TO_Y_UP[answers.up].T @ turn.T + np.array(answers.shift)
-
-
 def _chosen(path: str | Path, mesh: Mesh, objects: tuple[str, ...]) -> Mesh:
     """Return the mesh of some objects of a file, or of all."""
     if not objects:
@@ -144,60 +124,6 @@ def _chosen(path: str | Path, mesh: Mesh, objects: tuple[str, ...]) -> Mesh:
     used = np.unique(faces)
     vertices, faces = compact(mesh.vertices, faces)
     return Mesh(vertices, faces, mesh.red[used], {name: which[used] for name, which in mesh.objects.items()})
-
-
-def _check_objects(path: str | Path, mesh: Mesh, placed: np.ndarray, surface: Surface) -> None:
-    """Refuse a file one of whose objects is the body itself."""
-    if len(mesh.objects) < 2:
-        return
-    tree = cKDTree(placed)
-    for name, which in mesh.objects.items():
-        if which.all() or which.sum() < len(surface[0]) / 10:
-            continue
-        sample = placed[which][:: max(1, int(which.sum()) // 500)]
-        apart = np.abs(igl.signed_distance(sample, *surface, sign_type=WINDING)[0])
-        covered = tree.query(surface[0][::20])[0]
-        if np.median(apart) < ON_BODY and np.median(covered) < LOOSE_DISTANCE:
-            others = [other for other in mesh.objects if not (mesh.objects[other] & which).any()]
-            raise ValueError(
-                f"{path}: its object {name!r} is the body itself; there are {', '.join(mesh.objects)}: choose the "
-                f"garment, as with --object {others[0] if others else 'NAME'}"
-            )
-
-
-def _check_place(path: str | Path, vertices: np.ndarray, surface: Surface, answers: Answers) -> None:
-    """Refuse a mesh that is not around the body in the user's units and axis, and name those in which it is."""
-    height = np.ptp(surface[0][:, 1])
-
-    def distances(units: str, up: str) -> tuple[float, float]:
-        """Return the mean distance to the body [m], without and with a penalty for the inside.
-
-        Both are infinite for a mesh far larger or smaller than the body.
-        """
-        points = _placed(vertices, answers._replace(units=units, up=up))
-        smallest = 0.05 if (units, up) == (answers.units, answers.up) else 0.15
-        if not smallest * height < np.ptp(points, axis=0).max() < 1.5 * height:
-            return np.inf, np.inf
-        sample = points[:: max(1, len(points) // 500)]
-        signed = igl.signed_distance(sample, *surface, sign_type=WINDING)[0]
-        distance = np.mean(np.abs(signed))
-        return float(distance), float(distance + INSIDE_PENALTY * np.mean(np.maximum(-signed, 0.0)))
-
-    by_placement = {(units, up): distances(units, up) for units in UNITS for up in TO_Y_UP}
-    near = {key: penalised for key, (distance, penalised) in by_placement.items() if distance < MAX_MEAN_DISTANCE}
-    answered = near.get((answers.units, answers.up), np.inf)
-    if answered < np.inf and answered <= 2 * min(near.values()) + 0.01:
-        return
-    size = np.ptp(vertices, axis=0)
-    size_text = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {answers.units}, {answers.up.upper()} up"
-    if near:
-        units, up = min(near, key=near.get)
-        raise ValueError(f"{size_text}: that is not around the body. Is it meant to be --units {units} --up {up}?")
-    raise ValueError(
-        f"{size_text}: not around the body in any unit. The body is {height:.2f} m high with its middle at "
-        f"{np.round(0.5 * (surface[0].min(axis=0) + surface[0].max(axis=0)), 2)}: move the mesh onto the body in its "
-        "canonical pose"
-    )
 
 
 def _clean(path: str | Path, points: np.ndarray, faces: np.ndarray) -> tuple[Working, np.ndarray]:
@@ -224,15 +150,35 @@ def _clean(path: str | Path, points: np.ndarray, faces: np.ndarray) -> tuple[Wor
     points, faces = compact(points, faces[valid])
     index = np.full(len(first), -1)
     index[used] = np.arange(len(used))
+    _check_sides(path, points, faces)
+    return Working(points, faces, np.zeros(len(points), bool), log=tuple(log)), index[welded]
+
+
+def _check_sides(path: str | Path, points: np.ndarray, faces: np.ndarray) -> None:
+    """Refuse edges with more than two faces."""
     edges, _, face_count = edge_table(faces)
     crowded = np.flatnonzero(face_count > 2)
     if len(crowded):
         middle = np.round(points[edges[crowded[0]]].mean(axis=0), 3)
         raise ValueError(
             f"{path}: {len(crowded)} edges have more than two faces, the first at {middle} m: a cloth has two sides; "
-            "separate the layers there, or delete the inner faces"
+            "separate the layers there, delete the inner faces, or --sew less"
         )
-    return Working(points, faces, np.zeros(len(points), bool), log=tuple(log)), index[welded]
+
+
+def _sew(path: str | Path, working: Working, index: np.ndarray, answers: Answers) -> tuple[Working, np.ndarray]:
+    """Sew seams, and refuse one that stays open; return the garment, and the indices of the file's vertices in it."""
+    vertices, faces, joined, splits = sewn(working.vertices, working.faces, 1e-3 * answers.sew)
+    count = len(working.vertices) - len(vertices)
+    working = working._replace(vertices=vertices, faces=faces, pinned=np.zeros(len(vertices), bool))
+    _check_sides(path, vertices, faces)
+    if not answers.allow:
+        check_seams(path, vertices, faces)
+    if count:
+        working = working.logged(f"sewn: {count} vertices of borders lay within {answers.sew:g} mm of others")
+    if splits:
+        working = working.logged(f"sewn: {splits} vertices lay on edges of another border")
+    return working, np.where(index < 0, -1, joined[index])
 
 
 def _marked(path: str | Path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
@@ -336,7 +282,7 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
         raise ValueError(
             f"{path}: {100 * deep_share:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, "
             f"at most {-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose, or is "
-            f"worn elsewhere. {_better_place(points, surface)}--allow takes it as it is"
+            f"worn elsewhere. {better_place(points, surface)}--allow takes it as it is"
         )
     cleared = push_out(points, working.faces, *surface)
     signed = igl.signed_distance(cleared, *surface, sign_type=WINDING)[0]
@@ -352,7 +298,7 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
         raise ValueError(
             f"{path}: {int((moved > FARTHEST_PUSH).sum())} vertices would be pushed out of the body by more than "
             f"{1e3 * FARTHEST_PUSH:.0f} mm, the farthest by {1e3 * moved.max():.0f} mm, at {place} m: it is not worn "
-            f"like that. {_better_place(points, surface)}--allow takes it as it is"
+            f"like that. {better_place(points, surface)}--allow takes it as it is"
         )
     working = working._replace(vertices=cleared)
     if not moved.any():
@@ -360,109 +306,6 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
     return working.logged(
         f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most"
     )
-
-
-def _better_place(points: np.ndarray, surface: Surface) -> str:
-    """Return a hint at a place of a garment [V, 3] m at which it is pushed less, if there is one."""
-    sample = points[:: max(1, len(points) // 300)]
-    middle = points.mean(axis=0)
-
-    def inside(turn: float, shift: tuple[float, float, float]) -> float:
-        turned = Rotation.from_euler("y", turn, degrees=True).as_matrix()
-        signed = igl.signed_distance(sample @ turned.T + np.array(shift), *surface, sign_type=WINDING)[0]
-        return float(np.mean(np.maximum(CLEARANCE - signed, 0.0)) + 0.02 * np.mean(np.abs(signed)))
-
-    heights, sides = np.arange(-0.4, 0.41, 0.05), (-0.2, -0.1, 0.0, 0.1, 0.2)
-    places = [(0.0, (0.0, float(y), 0.0)) for y in heights]
-    places += [(0.0, (x, 0.0, z)) for x in sides for z in sides]
-    places += [(turn, (0.0, 0.0, 0.0)) for turn in (90.0, 180.0, 270.0)]
-    centred = (-float(middle[0]), 0.0, -float(middle[2]))
-    best = min([*places, (0.0, centred)], key=lambda place: inside(*place))
-    if inside(*best) > 0.5 * inside(0.0, (0.0, 0.0, 0.0)):
-        return "Move the mesh onto the body, or name its body with --body; "
-    turn, shift = best
-    flag = f"--turn {turn:.0f}" if turn else "--shift " + " ".join(f"{x:.2f}" for x in shift)
-    return f"It would be nearer with {flag}; "
-
-
-def _sewn(working: Working, distance: float) -> Working:
-    """Join borders that lie on each other within `distance` m, also where one has vertices that the other lacks."""
-    vertices, faces = working.vertices, working.faces
-    border = np.flatnonzero(boundary_mask(faces, len(vertices)))
-    near = border[cKDTree(vertices[border]).query_pairs(distance, output_type="ndarray")] if len(border) else border
-    edges = edge_table(faces)[0]
-    joined = {tuple(edge) for edge in edges.tolist()}
-    near = np.array([pair for pair in near.tolist() if tuple(sorted(pair)) not in joined], np.int64).reshape(-1, 2)
-    if len(near):
-        _, first, group = np.unique(components(len(vertices), near), return_index=True, return_inverse=True)
-        faces = group[faces]
-        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-        used = np.unique(faces)
-        vertices, pinned = vertices[first][used], working.pinned[first][used]
-        faces = np.searchsorted(used, faces)
-        working = working._replace(vertices=vertices, pinned=pinned)
-    faces, split = _split_at_borders(vertices, faces, max(distance, WELD_DISTANCE))
-    working = working._replace(faces=faces)
-    if len(near):
-        working = working.logged(
-            f"sewn: {len(near)} vertices of borders within {1e3 * distance:g} mm of another border"
-        )
-    if split:
-        working = working.logged(f"sewn: {split} vertices that lay on the edge of another border")
-    return working
-
-
-def _check_seams(path: str | Path, working: Working) -> None:
-    """Refuse a mesh with two borders that run closely beside each other, as along a seam that is not sewn."""
-    vertices, loops = working.vertices, boundary_loops(working.faces)
-    for number, loop in enumerate(loops):
-        others = np.concatenate([other for k, other in enumerate(loops) if k != number] or [loop[:0]])
-        if not len(others):
-            continue
-        apart = cKDTree(vertices[others]).query(vertices[loop])[0]
-        beside = apart < BESIDE
-        if beside.mean() > LEAST_BESIDE:
-            place, widest = np.round(vertices[loop][beside][0], 2), 1e3 * apart[beside].max()
-            raise ValueError(
-                f"{path}: two borders run {1e3 * np.median(apart[beside]):.1f} mm beside each other, as at {place} m: "
-                f"a seam that is not sewn? --sew {np.ceil(widest):.0f} sews it, --allow leaves it open"
-            )
-
-
-def _split_at_borders(vertices: np.ndarray, faces: np.ndarray, distance: float) -> tuple[np.ndarray, int]:
-    """Split border edges at the border vertices that lie on them; return faces and the number of splits."""
-    splits = 0
-    for _ in range(20):
-        edges, _, count = edge_table(faces)
-        open_edges = edges[count == 1]
-        border = np.unique(open_edges)
-        tree = cKDTree(vertices[border])
-        changed = {}
-        for a, b in open_edges.tolist():
-            along = vertices[b] - vertices[a]
-            length = np.linalg.norm(along)
-            middle = 0.5 * (vertices[a] + vertices[b])
-            for v in border[tree.query_ball_point(middle, 0.5 * length)].tolist():
-                share = (vertices[v] - vertices[a]) @ along / max(length, 1e-12) ** 2
-                off = np.linalg.norm(vertices[v] - vertices[a] - share * along)
-                if v not in (a, b) and distance < share * length < length - distance and off < distance:
-                    changed[a, b] = v
-                    break
-        if not changed:
-            break
-        result = []
-        for face in faces.tolist():
-            for k in range(3):
-                a, b, c = face[k], face[(k + 1) % 3], face[(k + 2) % 3]
-                v = changed.get((min(a, b), max(a, b)))
-                if v is not None and v != c:
-                    result += [[a, v, c], [v, b, c]]
-                    splits += 1
-                    break
-            else:
-                result.append(face)
-        faces = np.array(result)
-    return faces, splits
 
 
 def _pin_highest_opening(path: str | Path, working: Working) -> Working:

@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.files import storage
 from clothjax.geometry.topology import boundary_mask
-from data_prep import dressing, garment, user_mesh
+from data_prep import dressing, garment, placement, user_mesh
+from data_prep.placement import Placement
+from data_prep.program import METRES
 from data_prep.user_mesh import Answers, bring
 
 
@@ -63,10 +65,10 @@ def test_a_mesh_that_fits_is_left_as_it_is(skirt, body, names, save):
 @pytest.mark.parametrize("units, up", [("cm", "y"), ("mm", "z"), ("m", "z"), ("in", "y")])
 def test_units_and_axes_are_asked_for(skirt, body, names, save, units, up):
     vertices, faces = skirt
-    path = save(vertices @ user_mesh.TO_Y_UP[up] / user_mesh.UNITS[units], faces)
+    path = save(vertices @ placement.TO_Y_UP[up] / METRES[units], faces)
     with pytest.raises(ValueError, match=rf"skirt\.obj.*--units {units} --up {up}\?"):
         bring(path, body, names, Answers())
-    made, _ = bring(path, body, names, Answers(units, up))
+    made, _ = bring(path, body, names, Answers(Placement(units, up)))
     assert nearest(made.vertices, vertices).max() < 1e-4
 
 
@@ -254,15 +256,15 @@ def test_the_program_writes_a_garment_and_its_picture(skirt, body, save, tmp_pat
     assert (tmp_path / "mine.garment.png").stat().st_size > 1e4 and "openings" in capsys.readouterr().out
 
 
-def seamed(skirt, fronts=20, backs=20, gap=0.0):
-    """A skirt of two panels, of a front and a back with a number of vertices along their side seams."""
+def seamed(skirt, fronts=20, backs=20, gap=0.0, both=True):
+    """A skirt of a front and a back with a number of vertices along their side seams, both or one of them open."""
     vertices, _ = skirt
     top, low = vertices[:, 1].max(), vertices[:, 1].min()
     rows = []
     for start, count in ((0.0, fronts), (np.pi, backs)):
         around, height = np.meshgrid(np.linspace(start, start + np.pi, 17), np.linspace(top, low, count), indexing="ij")
         wide = 0.24 + 0.3 * (top - height)
-        side = np.sign(np.sin(start + 1.0)) * 0.5 * gap
+        side = np.sign(np.sin(start + 1.0)) * 0.5 * gap * (1.0 if both else (1 - np.cos(around)) / 2)
         points = np.stack([wide * np.cos(around), height, 0.8 * wide * np.sin(around) + side], axis=-1)
         number = np.arange(17 * count).reshape(17, count)
         a, b, c, d = (
@@ -275,7 +277,7 @@ def seamed(skirt, fronts=20, backs=20, gap=0.0):
 
 def test_a_seam_whose_sides_have_other_vertices_is_sewn(skirt, body, names, save):
     made, said = bring(save(*seamed(skirt, 20, 39)), body, names, Answers(pin="highest"))
-    assert any(line.startswith("sewn: 38 vertices that lay on the edge") for line in said)
+    assert any(line.startswith("sewn: 38 vertices lay on edges") for line in said)
     assert made.pinned.sum() == 32 and np.ptp(made.vertices[made.pinned, 1]) < 0.03
     assert any("1 part, 2 openings" in line for line in said)
 
@@ -288,6 +290,33 @@ def test_a_seam_that_is_open_is_refused_or_sewn(skirt, body, names, save):
     assert made.pinned.sum() == 32 and any("1 part, 2 openings" in line for line in said)
     _, said = bring(path, body, names, Answers(allow=True))
     assert any("2 parts, 2 openings" in line for line in said)
+
+
+def test_a_seam_of_one_border_with_itself_is_noticed(skirt, body, names, save):
+    """A tube that is cut once has one border: down one side of the seam and up the other."""
+    path = save(*seamed(skirt, gap=5e-4, both=False))
+    with pytest.raises(ValueError, match=r"beside each other, as at .*--sew 1 sews it"):
+        bring(path, body, names, Answers())
+    _, said = bring(path, body, names, Answers(sew=1.0))
+    assert any("1 part, 2 openings" in line for line in said)
+
+
+@pytest.mark.parametrize("fronts, backs, gap", [(20, 39, 5e-4), (5, 150, 0.0)])
+def test_sides_of_a_seam_may_have_very_different_vertices(fronts, backs, gap, skirt, body, names, save):
+    made, said = bring(save(*seamed(skirt, fronts, backs, gap)), body, names, Answers(pin="highest", sew=1.0))
+    assert any("1 part, 2 openings" in line for line in said) and made.pinned.sum() == 32
+
+
+def test_what_is_marked_is_pinned_after_a_seam_is_sewn(skirt, body, names, save):
+    vertices, faces = seamed(skirt, gap=5e-4)
+    top = vertices[:, 1] > vertices[:, 1].max() - 1e-6
+    colours = np.where(top[:, None], [255, 0, 0, 255], [255, 255, 255, 255]).astype(np.uint8)
+    path = save(vertices, faces, "painted.ply", colours)
+    answers = Answers(pin="red", sew=1.0, cloth=("red=2,3,4",))
+    made, _ = bring(path, body, names, answers)
+    high = made.vertices[:, 1] > vertices[:, 1].max() - 0.01
+    np.testing.assert_array_equal(made.pinned, high)
+    np.testing.assert_array_equal((made.cloth == [2, 3, 4]).all(axis=1), high)
 
 
 def test_an_open_front_is_pinned_above_a_height(skirt, body, names, save):
@@ -322,8 +351,8 @@ def test_a_garment_that_is_worn_elsewhere_is_refused_with_the_place(turn, shift,
     with pytest.raises(ValueError, match=rf"{flag}; --allow takes it as it is"):
         bring(path, body, names, Answers())
     words = flag.split()
-    answers = Answers(turn=float(words[1])) if "turn" in flag else Answers(shift=tuple(map(float, words[1:])))
-    made, _ = bring(path, body, names, answers)
+    place = Placement(turn=float(words[1])) if "turn" in flag else Placement(shift=tuple(map(float, words[1:])))
+    made, _ = bring(path, body, names, Answers(place))
     assert nearest(made.vertices, vertices).max() < 1e-3
 
 

@@ -1,0 +1,107 @@
+"""Seams of a mesh of panels: borders that lie on each other are joined, those that nearly do are told."""
+
+from pathlib import Path
+
+import igl
+import numpy as np
+from scipy.spatial import cKDTree
+
+from clothjax.geometry.topology import boundary_mask, components
+from data_prep.mesh import edge_table
+
+WELD_DISTANCE = 1e-4  # m; closer vertices become one
+BESIDE = 0.002  # m, between the sides of a seam that is not sewn
+LEAST_BESIDE = 0.05  # m, for which they must run so
+NEIGHBOUR = 0.02  # m along a border, within which it is beside itself at any rate
+SPACING = 2.5e-4  # m, between the points of a border that are compared
+
+
+def sewn(vertices: np.ndarray, faces: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Join borders within `distance` m of each other, also where one has vertices that the other lacks.
+
+    Returns:
+        Vertices [W, 3] m and faces of the joined mesh, for each of the given vertices [V] its index there, and the
+        number of border vertices that were set into the edges of another border.
+    """
+    border = np.flatnonzero(boundary_mask(faces, len(vertices)))
+    near = np.zeros((0, 2), np.int64)
+    if len(border):
+        near = border[cKDTree(vertices[border]).query_pairs(distance, output_type="ndarray")]
+    edges, size = edge_table(faces)[0], len(vertices)
+    near = near[~np.isin(near.min(axis=1) * size + near.max(axis=1), edges[:, 0] * size + edges[:, 1])]
+    _, first, index = np.unique(components(size, near), return_index=True, return_inverse=True)
+    vertices, faces = vertices[first], index[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    faces, splits = _split_at_borders(vertices, faces, max(distance, WELD_DISTANCE))
+    return vertices, faces, index, splits
+
+
+def _split_at_borders(vertices: np.ndarray, faces: np.ndarray, distance: float) -> tuple[np.ndarray, int]:
+    """Split border edges at the border vertices within `distance` m of them; return faces and the number of splits."""
+    splits = 0
+    while True:
+        edges, _, count = edge_table(faces)
+        border = np.unique(edges[count == 1])
+        tree, at = cKDTree(vertices[border]) if len(border) else None, {}
+        for a, b in edges[count == 1].tolist():
+            along = vertices[b] - vertices[a]
+            length = float(np.linalg.norm(along))
+            inside = border[tree.query_ball_point(0.5 * (vertices[a] + vertices[b]), 0.5 * length)]
+            place = (vertices[inside] - vertices[a]) @ along / max(length, 1e-12)
+            off = np.linalg.norm(vertices[inside] - vertices[a] - np.outer(place / max(length, 1e-12), along), axis=1)
+            on = (distance < place) & (place < length - distance) & (off < distance)
+            if on.any():  # nearest to the middle, so that many vertices on one edge take few rounds
+                at[a, b] = int(inside[on][np.abs(place[on] - 0.5 * length).argmin()])
+        kept, halves = [], []
+        for face in faces.tolist():
+            corners = [(face[k], face[(k + 1) % 3], face[(k + 2) % 3]) for k in range(3)]
+            split = next((c for c in corners if at.get((min(c[:2]), max(c[:2])), c[2]) != c[2]), None)
+            if split is None:
+                kept.append(face)
+            else:
+                a, b, c = split
+                middle = at[min(a, b), max(a, b)]
+                halves += [[a, middle, c], [middle, b, c]]
+        if not halves:
+            return faces, splits
+        faces, splits = np.array(kept + halves), splits + len(halves) // 2
+
+
+def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Refuse a mesh whose borders run closely beside each other, or a border beside itself, as an open seam does.
+
+    Raises:
+        ValueError: naming the file, the place, and the distance that sews it.
+    """
+    loops = [_dense(vertices[loop]) for loop in igl.boundary_loop_all(igl.bfs_orient(faces)[0])]
+    if not loops:
+        return
+    points, along = (np.concatenate(parts) for parts in zip(*loops, strict=True))
+    whole = np.concatenate([np.full(len(own), own[-1]) for _, own in loops])
+    number = np.concatenate([np.full(len(own), k) for k, (_, own) in enumerate(loops)])
+    pairs = cKDTree(points).query_pairs(BESIDE, output_type="ndarray")
+    a, b = pairs.T
+    between = np.abs(along[a] - along[b])
+    between = np.minimum(between, whole[a] - between)
+    pairs = pairs[(number[a] != number[b]) | (between > NEIGHBOUR)]
+    apart = np.full(len(points), np.inf)
+    distance = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    for side in pairs.T:
+        np.minimum.at(apart, side, distance)
+    for k in range(len(loops)):
+        beside = (number == k) & np.isfinite(apart)
+        if SPACING * beside.sum() > LEAST_BESIDE:
+            place, wide = np.round(points[beside][0], 2), 1e3 * np.quantile(apart[beside], 0.9)
+            raise ValueError(
+                f"{path}: two borders run {1e3 * np.median(apart[beside]):.1f} mm beside each other, as at {place} m: "
+                f"a seam that is not sewn? --sew {np.ceil(wide):.0f} sews it, --allow leaves it open"
+            )
+
+
+def _dense(loop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [n, 3] at most SPACING apart along a closed line [m, 3] m, and how far along it they are [n]."""
+    ends = np.concatenate([loop, loop[:1]])
+    lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+    reached = np.concatenate([[0.0], np.cumsum(lengths)])
+    at = np.linspace(0.0, reached[-1], int(reached[-1] / SPACING) + 2)
+    return np.stack([np.interp(at, reached, axis) for axis in ends.T], axis=1), at
