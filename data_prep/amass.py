@@ -18,24 +18,23 @@ from clothjax.files.damage import UNREADABLE
 from clothjax.files.storage import Rig, canonical_rotation, load_rig
 from clothjax.types import Motion
 from data_prep import skeleton
-from data_prep.program import MotionOptions, run, write_motion
-from data_prep.retarget import FROZEN, Capture, cmu_names, from_t_pose, leg_length, resample, stand
+from data_prep.program import METRES, MotionOptions, Unit, run, write_motion
+from data_prep.recording import Capture, resample
+from data_prep.retarget import FROZEN, from_t_pose, leg_length, stand
+from data_prep.skeleton import cmu_names
 from data_prep.smpl import BODY
 
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-
-
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 FASTEST, HIGHEST = 15.0, 10.0  # m/s and m, of a pelvis whose path is in metres
 
 
-def read_amass(path: str | Path, up: Literal["y", "z"] | None = None, units: str = "m") -> Capture:
+def read_amass(path: str | Path, up: Literal["y", "z"] | None = None, units: Unit = "m") -> Capture:
     """Read a recording with +Y up and CMU's joint names; it has no skeleton, so its offsets are zero.
 
     Args:
         path: .npz.
         up: axis that points up; None for the one along which the figures stand.
-        units: of the path, of `METRES`.
+        units: of the path.
 
     Raises:
         ValueError: naming the file, the array and the first wrong entry; for a path that is not in `units`.
@@ -148,7 +147,7 @@ class Arguments(MotionOptions):
     output: tyro.conf.Positional[Path]
     up: Literal["y", "z"] | None = None
     """Axis of the file that points up; it is the one along which the figures stand unless given."""
-    units: Literal["m", "cm", "mm"] = "m"
+    units: Unit = "m"
     """Unit of the path."""
     leg: float = 0.8
     """Length of the recorded person's leg, hip to ankle, m."""

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.retarget import Capture, numbers, read_lines
+from data_prep.recording import Capture, numbers, read_lines
 
 CMU_NAMES = {
     "root": "Hips",

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.retarget import Capture, cmu_names, numbers, read_lines
+from data_prep.recording import Capture, numbers, read_lines
+from data_prep.skeleton import cmu_names
 
 SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of motion capture
 STILL = 1e-3  # of the longest bone, by which a joint that does not move on its parent may move
@@ -39,6 +40,11 @@ def read_bvh(path: str | Path) -> Capture:
     (duration,) = numbers(path, line, words[2:], 1)
     if frames < 1 or duration <= 0:
         raise ValueError(f"{path}, line {line}: {frames} frames of {duration} s: both must be > 0")
+    if not SLOWEST <= 1 / duration <= FASTEST:
+        raise ValueError(
+            f"{path}, line {line}: a Frame Time of {duration:g} would be {1 / duration:.3g} frames a second: it is in "
+            f"seconds, such as {1 / 30:.4f}"
+        )
     width = sum(map(len, channels))
     rows = []
     for line, words in lines:
@@ -46,11 +52,6 @@ def read_bvh(path: str | Path) -> Capture:
     if len(rows) != frames:
         raise ValueError(f"{path}, line {line}: {len(rows)} frames, {frames} announced; cut short?")
 
-    if not SLOWEST <= 1 / duration <= FASTEST:
-        raise ValueError(
-            f"{path}: a Frame Time of {duration:g} would be {1 / duration:.3g} frames a second: it is in seconds, "
-            f"such as {1 / 30:.4f}"
-        )
     values, column = np.array(rows), 0
     rotations = np.tile(np.eye(3), (frames, len(names), 1, 1))
     places = np.tile(offsets, (frames, 1, 1))
@@ -89,6 +90,7 @@ def _below_the_path(
         rotations = np.concatenate([rotations[:, :1] @ rotations[:, 1:2], rotations[:, 2:]], axis=1)
         places = np.concatenate([path[:, None], places[:, 2:]], axis=1)
         names, offsets, parents = names[1:], offsets[1:], [-1, *(parent - 1 for parent in parents[2:])]
+    offsets[0] = 0.0  # the root has its path
     return Capture(names, np.array(parents), offsets, rotations, places[:, 0], fps)
 
 

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from clothjax.files.storage import canonical_rotation, joint_names, load_rig, save_motion
 from clothjax.types import Motion
 from data_prep.program import run
-from data_prep.retarget import cmu_names, from_t_pose, stand
+from data_prep.retarget import from_t_pose, stand
+from data_prep.skeleton import cmu_names
 
 # cycles per second, before the factor of the seed
 RATES = {"walk": 0.9, "run": 1.35, "jump": 0.5, "arms": 0.35, "twist": 0.4, "dance": 0.8}

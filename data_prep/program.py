@@ -10,8 +10,9 @@ from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
 from clothjax.types import Motion
 from data_prep import skeleton
+from data_prep.recording import Capture
 from data_prep.repair import Bad, mend
-from data_prep.retarget import Axes, Capture, retarget
+from data_prep.retarget import Axes, retarget
 
 
 def run(main: Callable[[Any], None], arguments: type, description: str) -> None:
@@ -42,6 +43,8 @@ class MotionOptions:
     licence: str = "of the recording"
 
 
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+Unit = Literal["m", "cm", "mm", "in", "ft"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
@@ -69,23 +72,26 @@ def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, reco
     Raises:
         ValueError: as `retarget`. If joints are not known, a mapping file to fill in is written and named.
     """
-    if options.joints is None:
+    if options.joints is not None:
+        parts = skeleton.mapped(capture.names, capture.parents, options.joints, options.allow)
+    else:
         try:
-            skeleton.find(capture.names, capture.parents, str(recording), options.allow)
+            parts = skeleton.find(capture.names, capture.parents, str(recording), options.allow)
         except ValueError as error:
             draft = Path(f"{recording.name.partition('.')[0]}_joints.yaml")
-            draft.write_text(skeleton.guess(capture.names, capture.parents))
+            if not draft.exists():  # it may have been filled in
+                draft.write_text(skeleton.guess(capture.names, capture.parents))
             raise ValueError(f"{error}; {draft} is a first guess of one") from error
     return retarget(
         capture,
         rig.body,
         rig.names,
+        parts,
         fps=options.fps,
         abduct=options.abduct,
         drop_clavicles=options.drop_clavicles,
         freeze=options.freeze,
         axes=Axes(options.up, options.forward),
-        joints=options.joints,
         allow=options.allow,
         about=str(recording),
     )

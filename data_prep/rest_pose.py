@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from clothjax.body.plausibility import kinematics
+from data_prep.recording import Capture
 from data_prep.skeleton import SIDES, Parts
 
 AXES = {sign + axis: (1 - 2 * (sign == "-")) * np.eye(3)["xyz".index(axis)] for axis in "xyz" for sign in ("", "-")}
@@ -31,15 +33,9 @@ class Figure(NamedTuple):
         return unit(self.positions[:, end] - self.positions[:, start])
 
 
-def figure(parents: np.ndarray, offsets: np.ndarray, rotations: np.ndarray, translation: np.ndarray) -> Figure:
-    """Return where joints are: forward kinematics of offsets [n, 3], rotations [T, n, 3, 3] and a path [T, 3]."""
-    positions, world = np.zeros(rotations.shape[:3]), rotations.copy()
-    for j, parent in enumerate(parents):
-        if parent < 0:
-            positions[:, j] = translation
-        else:
-            world[:, j] = world[:, parent] @ rotations[:, j]
-            positions[:, j] = positions[:, parent] + world[:, parent] @ offsets[j]
+def figure(capture: Capture, rotations: np.ndarray, path: np.ndarray) -> Figure:
+    """Return where the joints of a recording are, with rotations [T, n, 3, 3] and a path [T, 3] of the root."""
+    world, positions = kinematics(rotations, path, capture.offsets, capture.parents)
     return Figure(positions, world)
 
 
@@ -65,14 +61,18 @@ def turn_upright(up: np.ndarray, forward: np.ndarray | None = None) -> np.ndarra
     return Rotation.from_rotvec(0.5 * np.pi * about).as_matrix()
 
 
-def up_axis(moving: Figure, resting: Figure, parts: Parts) -> str | None:
+def up_axis(moving: Figure, parts: Parts, rest: str | None) -> str | None:
     """Return the axis of a file that points up, such as `z`; None if the frames do not say.
 
-    A figure that crawls or lies is not upright; then the rest pose says it, if it is one.
+    A figure that crawls or lies is not upright; then the rest pose says it.
+
+    Args:
+        moving: all frames.
+        parts: of the figure.
+        rest: the axis that points up in its rest pose, of `is_rest_pose`.
     """
     mean = upright(moving, parts)
     name = max(AXES, key=lambda axis: float(mean @ AXES[axis]))
-    rest = is_rest_pose(resting, parts)
     if (rest is not None and mean @ AXES[rest] > 0.3) or mean @ AXES[name] < UPRIGHT:
         return rest
     return name

@@ -5,64 +5,20 @@ figure stands like the body (`rest_pose.py`). Bones of arms and legs are aligned
 The root's path is scaled by the length of a leg. At last the result is compared with the recording.
 """
 
-import codecs
-from collections.abc import Iterator
-from gzip import open as open_gzip
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
-from clothjax.body.plausibility import joint_positions
+from clothjax.body.plausibility import joint_positions, kinematics
 from clothjax.types import Body, Motion
 from data_prep import skeleton
+from data_prep.recording import Capture, resample
 from data_prep.rest_pose import AXES, Figure, figure, is_rest_pose, standing, turn_upright, unit, up_axis
-from data_prep.skeleton import Parts
+from data_prep.skeleton import Parts, cmu_names
 
-CMU_FROM_SMPL = {
-    "pelvis": "Hips",
-    "spine1": "LowerBack",
-    "spine2": "Spine",
-    "spine3": "Spine1",
-    "neck": "Neck",
-    "head": "Head",
-    "left_collar": "LeftShoulder",
-    "left_shoulder": "LeftArm",
-    "left_elbow": "LeftForeArm",
-    "left_wrist": "LeftHand",
-    "left_hip": "LeftUpLeg",
-    "left_knee": "LeftLeg",
-    "left_ankle": "LeftFoot",
-    "left_foot": "LeftToeBase",
-    "right_collar": "RightShoulder",
-    "right_shoulder": "RightArm",
-    "right_elbow": "RightForeArm",
-    "right_wrist": "RightHand",
-    "right_hip": "RightUpLeg",
-    "right_knee": "RightLeg",
-    "right_ankle": "RightFoot",
-    "right_foot": "RightToeBase",
-}
 FROZEN = ("Hand", "Finger", "Thumb", "Toe")
-NEXT = {"upper arm": "forearm", "forearm": "hand", "thigh": "shin", "shin": "foot", "foot": "toe"}  # ends of bones
 MOST_APART = 20.0  # degrees, between a bone of the result and of the recording
-
-
-class Capture(NamedTuple):
-    """A recorded motion of a skeleton in any unit of length."""
-
-    names: tuple[str, ...]  # CMU's for joints that CMU has
-    parents: np.ndarray  # [n] root first with -1, parents before children
-    offsets: np.ndarray  # [n, 3] from the parent, in the rest pose
-    rotations: np.ndarray  # [T, n, 3, 3] local to the parent, identity in the rest pose
-    translation: np.ndarray  # [T, 3] of the root
-    fps: float
-
-
-def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return joint names with SMPL's replaced by CMU's."""
-    return tuple(CMU_FROM_SMPL.get(n, n) for n in names)
 
 
 class Axes(NamedTuple):
@@ -79,13 +35,13 @@ def retarget(
     capture: Capture,
     body: Body,
     names: tuple[str, ...],
+    parts: Parts | None = None,
     *,
     fps: float = 30.0,
     abduct: float = 0.0,
     drop_clavicles: float = 0.0,
     freeze: bool = True,
     axes: Axes = FOUND,
-    joints: Path | None = None,
     allow: bool = False,
     about: str = "the recording",
 ) -> Motion:
@@ -95,68 +51,69 @@ def retarget(
         capture: the recording.
         body: to move.
         names: of its joints.
+        parts: of the recording; None to find them by the names of its joints.
         fps: frames per second of the result; rotations between two frames are interpolated on the sphere.
         abduct: degrees by which the upper arms are taken outward.
         drop_clavicles: degrees by which the clavicles are lowered.
         freeze: keep hands, fingers and toes as in the canonical pose; captured ones are often noise.
         axes: of the recording.
-        joints: mapping file of `skeleton.mapped`, for names that are not known.
-        allow: take a recording without arms or head, and one from which the result differs.
+        allow: take a result that differs from the recording.
         about: name of the recording, for messages.
 
     Raises:
-        ValueError: if parts of the body are missing, or it is not seen which way is up; if the result differs from the
-            recording; if the recording is shorter than two frames.
+        ValueError: if parts of the body are missing; if it is not seen which way is up, or the axes do not go together;
+            if the result differs from the recording; if the recording is shorter than two frames.
     """
     capture = resample(capture, fps)
     names = cmu_names(names)
     of_body = skeleton.find(names, body.parents, "the body")
-    if joints is None:
-        of_file = skeleton.find(capture.names, capture.parents, about, allow)
-    else:
-        of_file = skeleton.mapped(capture.names, capture.parents, joints, allow)
-    shown = figure(capture.parents, capture.offsets, capture.rotations, capture.translation)
-    still = np.tile(np.eye(3), (1, len(capture.names), 1, 1))
-    resting = figure(capture.parents, capture.offsets, still, np.zeros((1, 3)))
-    up = axes.up or up_axis(shown, resting, of_file)
+    of_file = skeleton.find(capture.names, capture.parents, about) if parts is None else parts
+    shown = figure(capture, capture.rotations, capture.translation)
+    resting = figure(capture, np.tile(np.eye(3), (1, len(capture.names), 1, 1)), np.zeros((1, 3)))
+    rest = is_rest_pose(resting, of_file)
+    up = axes.up or up_axis(shown, of_file, rest)
     if up is None:
         raise ValueError(f"{about}: it does not show which way is up: give --up y or --up z")
+    if axes.forward is not None and axes.forward[-1] == up[-1]:
+        raise ValueError(f"{about}: {up} is up, so --forward {axes.forward} cannot be forward")
     shown = shown.turned(turn_upright(AXES[up], None if axes.forward is None else AXES[axes.forward]))
-    rest = is_rest_pose(resting, of_file)
     if rest is None:
         reference = standing(shown, resting, capture.parents, of_file)
     else:
         reference = np.tile(turn_upright(AXES[rest]), (len(capture.names), 1, 1))
-    local = reference.copy()
-    local[1:] = np.swapaxes(reference[capture.parents[1:]], -1, -2) @ reference[1:]
-    posed = figure(capture.parents, capture.offsets, local[None], np.zeros((1, 3))).positions[0]
+    posed = figure(capture, relative(reference[None], capture.parents), np.zeros((1, 3))).positions[0]
 
     corrections = _corrections(abduct, drop_clavicles)
     pairs = _pairs(of_file, capture.names, of_body, names)
     frozen = _beyond(body.parents, of_body) if freeze else set()
+    part_of = {joint: part for part, joint in of_body.limbs.items()}
     world = np.zeros((len(shown.positions), len(names), 3, 3))
     for j, parent in enumerate(body.parents):
         if j in frozen or j not in pairs:
             world[:, j] = world[:, parent] if parent >= 0 else np.eye(3)
             continue
-        part = next((part for part, joint in of_body.limbs.items() if joint == j), "")
-        end = f"{part.partition(' ')[0]} {NEXT.get(part.partition(' ')[2])}"
-        align = np.eye(3)
+        own, part, align = pairs[j], part_of.get(j, ""), np.eye(3)
+        end = skeleton.end_of(part)
         if end in of_file.limbs and end in of_body.limbs:
-            own, other = pairs[j], of_file.limbs[end]
-            align = _between(body.joints[of_body.limbs[end]] - body.joints[j], posed[other] - posed[own])
-        world[:, j] = shown.rotations[:, pairs[j]] @ reference[pairs[j]].T @ corrections.get(part, np.eye(3)) @ align
+            bone = body.joints[of_body.limbs[end]] - body.joints[j]
+            align = _between(bone, posed[of_file.limbs[end]] - posed[own])
+        world[:, j] = shown.rotations[:, own] @ reference[own].T @ corrections.get(part, np.eye(3)) @ align
     _fill(world, of_body, pairs)
-    rotations = world.copy()
-    rotations[:, 1:] = np.swapaxes(world[:, body.parents[1:]], -1, -2) @ world[:, 1:]
 
     scale = leg_length(body.joints, of_body) / leg_length(posed, of_file)
     path = shown.positions[:, of_file.hips]
     path = (path - path[0] * [1, 0, 1]) * scale - body.joints[0]
-    motion = stand(Motion(rotations.astype(np.float32), path, float(fps)), body)
+    motion = stand(Motion(relative(world, body.parents).astype(np.float32), path, float(fps)), body)
     if not allow:
         compare(motion, body, of_body, shown, of_file, about, abduct + drop_clavicles)
     return motion
+
+
+def relative(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Return rotations [T, J, 3, 3] local to the parents, of world rotations [T, J, 3, 3]."""
+    rotations = world.copy()
+    rotations[:, 1:] = np.swapaxes(world[:, parents[1:]], -1, -2) @ world[:, 1:]
+    return rotations
 
 
 def _pairs(of_file: Parts, file_names: tuple[str, ...], of_body: Parts, names: tuple[str, ...]) -> dict[int, int]:
@@ -209,10 +166,10 @@ def compare(
     def directions(positions: np.ndarray, parts: Parts) -> dict[str, np.ndarray]:
         limbs = parts.limbs
         ends = {"trunk": (parts.hips, parts.chain[-1]), "hips": (limbs["right thigh"], limbs["left thigh"])}
-        for part, (side, own) in ((part, part.split(" ", 1)) for part in limbs):
-            end = f"{side} {NEXT.get(own)}"
-            if own in ("upper arm", "forearm", "thigh", "shin") and end in limbs:
-                ends[part] = (limbs[part], limbs[end])
+        for part, joint in limbs.items():
+            end = skeleton.end_of(part)
+            if end in limbs and not end.endswith("toe"):
+                ends[part] = (joint, limbs[end])
         return {part: unit(positions[:, end] - positions[:, start]) for part, (start, end) in ends.items()}
 
     found, recorded = directions(positions, of_body), directions(shown.positions, of_file)
@@ -251,44 +208,14 @@ def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...]
         turned[:, j] = turned[:, parent] if parent >= 0 else np.eye(3)
         if name in local:
             turned[:, j] = turned[:, j] @ local[name]
-    turned = turned @ to_t_pose
-    rotations = turned.copy()
-    rotations[:, 1:] = np.swapaxes(turned[:, body.parents[1:]], -1, -2) @ turned[:, 1:]
-    return rotations
-
-
-def resample(capture: Capture, fps: float) -> Capture:
-    """Resample a recording: take every k-th frame, or interpolate if the rates are not multiples.
-
-    Raises:
-        ValueError: for a rate that is not > 0, or a recording of fewer than two frames.
-    """
-    frames = len(capture.translation)
-    if not fps > 0:
-        raise ValueError(f"fps must be > 0, got {fps}")
-    if frames < 2:
-        raise ValueError(f"the recording has {frames} frames: it needs two at least")
-    ratio = capture.fps / fps
-    if abs(ratio - round(ratio)) < 1e-3 * ratio and round(ratio) >= 1:
-        every = slice(None, None, round(ratio))
-        return capture._replace(rotations=capture.rotations[every], translation=capture.translation[every], fps=fps)
-    old = np.arange(frames) / capture.fps
-    new = np.arange(int(np.floor(old[-1] * fps + 1e-6)) + 1) / fps
-    new = np.minimum(new, old[-1])
-    rotations = np.empty((len(new), *capture.rotations.shape[1:]))
-    for j in range(rotations.shape[1]):
-        rotations[:, j] = Slerp(old, Rotation.from_matrix(capture.rotations[:, j]))(new).as_matrix()
-    translation = np.stack([np.interp(new, old, x) for x in capture.translation.T], axis=1)
-    return capture._replace(rotations=rotations, translation=translation, fps=fps)
+    return relative(turned @ to_t_pose, body.parents)
 
 
 def stand(motion: Motion, body: Body) -> Motion:
     """Move a motion up or down, so that the body (betas 0) reaches below y = 0 in 2 % of the frames."""
-    turned = np.array(motion.rotations, np.float64)
-    for j, parent in enumerate(body.parents):
-        if parent >= 0:
-            turned[:, j] = turned[:, parent] @ turned[:, j]
-    shift = joint_positions(motion, body) - np.einsum("tjab,jb->tja", turned, body.joints)
+    offsets = body.joints - body.joints[np.maximum(body.parents, 0)]
+    turned, positions = kinematics(motion.rotations, body.joints[0] + motion.translation, offsets, body.parents)
+    shift = positions - np.einsum("tjab,jb->tja", turned, body.joints)
     rows = np.concatenate([turned[:, :, 1], shift[:, :, 1:2]], axis=-1)  # the row of each transform that gives y
     points = np.concatenate([body.vertices, np.ones((len(body.vertices), 1))], axis=1)
     weights = np.asarray(body.weights, np.float64)
@@ -296,42 +223,6 @@ def stand(motion: Motion, body: Body) -> Motion:
     # rounded to float32: the digits beyond are noise that a file could not compress
     path = np.float32(motion.translation - np.array([0, np.percentile(lowest, 2), 0]))
     return motion._replace(translation=path.astype(np.float64))
-
-
-def read_lines(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and words of each line that is not blank, of a text file or its .gz.
-
-    Raises:
-        ValueError: if the file cannot be read.
-    """
-    try:
-        opener = open_gzip if str(path).endswith(".gz") else open
-        with opener(path, "rb") as file:
-            marked = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-        with opener(path, "rt", encoding="utf-16" if marked else "utf-8-sig", errors="replace") as file:
-            for number, line in enumerate(file, 1):
-                words = line.split()
-                if words:
-                    yield number, words
-    except (OSError, EOFError) as error:  # EOFError: a .gz cut short
-        raise ValueError(f"{path}: cannot be read ({error})") from error
-
-
-def numbers(path: str | Path, line: int, words: list[str], count: int | None = None) -> list[float]:
-    """Convert words to finite numbers.
-
-    Raises:
-        ValueError: naming file and line, if a word is not a number or there are not `count` of them.
-    """
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise ValueError(f"{path}, line {line}: {error}; expected numbers") from error
-    if count is not None and len(values) != count:
-        raise ValueError(f"{path}, line {line}: {len(values)} numbers, expected {count}")
-    if not np.all(np.isfinite(values)):
-        raise ValueError(f"{path}, line {line}: {' '.join(words)!r} has a number that is not finite")
-    return values
 
 
 def _corrections(abduct: float, drop_clavicles: float) -> dict[str, np.ndarray]:

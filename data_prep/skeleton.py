@@ -12,8 +12,34 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
+CMU_FROM_SMPL = {
+    "pelvis": "Hips",
+    "spine1": "LowerBack",
+    "spine2": "Spine",
+    "spine3": "Spine1",
+    "neck": "Neck",
+    "head": "Head",
+    "left_collar": "LeftShoulder",
+    "left_shoulder": "LeftArm",
+    "left_elbow": "LeftForeArm",
+    "left_wrist": "LeftHand",
+    "left_hip": "LeftUpLeg",
+    "left_knee": "LeftLeg",
+    "left_ankle": "LeftFoot",
+    "left_foot": "LeftToeBase",
+    "right_collar": "RightShoulder",
+    "right_shoulder": "RightArm",
+    "right_elbow": "RightForeArm",
+    "right_wrist": "RightHand",
+    "right_hip": "RightUpLeg",
+    "right_knee": "RightLeg",
+    "right_ankle": "RightFoot",
+    "right_foot": "RightToeBase",
+}
 SIDES = ("left", "right")
 ARM, LEG = ("clavicle", "upper arm", "forearm", "hand"), ("thigh", "shin", "foot", "toe")
+SIDED = tuple(f"{side} {part}" for side in SIDES for part in (*ARM, *LEG))
+MIDDLE = ("hips", "neck", "head")
 NEEDED = ("upper arm", "forearm", "thigh", "shin", "foot")  # of either side; and hips, neck or head
 ARMS = (  # names of ARM by scheme, without side and separators
     ("shoulder", "arm", "forearm", "hand"),
@@ -48,11 +74,10 @@ class Parts(NamedTuple):
         """Joints from the hips to the head."""
         return (self.hips, *self.spine, *self.neck)
 
-    def named(self, names: tuple[str, ...]) -> dict[str, str]:
-        """Return the names of the joints by part, as `mapped` takes them."""
-        chains = {"spine": self.spine, "neck": self.neck}
-        rows = {f"{part} {i + 1}": names[joint] for part, chain in chains.items() for i, joint in enumerate(chain)}
-        return {"hips": names[self.hips]} | rows | {part: names[joint] for part, joint in self.limbs.items()}
+
+def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return joint names with SMPL's replaced by CMU's."""
+    return tuple(CMU_FROM_SMPL.get(n, n) for n in names)
 
 
 def find(names: tuple[str, ...], parents: np.ndarray, about: str = "the skeleton", allow: bool = False) -> Parts:
@@ -67,11 +92,7 @@ def find(names: tuple[str, ...], parents: np.ndarray, about: str = "the skeleton
     Raises:
         ValueError: that names all parts that are not found, with all joints.
     """
-    sided = {}
-    for joint, (side, core) in enumerate(map(_split, _without_prefix(names))):
-        sided.setdefault((side, core), joint)
-    limbs = _limbs(sided, parents, ARM, ARMS) | _limbs(sided, parents, LEG, LEGS)
-    return _whole(names, parents, limbs, sided, about, allow)
+    return _whole(names, parents, *_known(names, parents), about, allow)
 
 
 def mapped(names: tuple[str, ...], parents: np.ndarray, path: Path, allow: bool = False) -> Parts:
@@ -84,32 +105,39 @@ def mapped(names: tuple[str, ...], parents: np.ndarray, path: Path, allow: bool 
         rows = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: not a mapping of joints ({error})") from error
-    known = [f"{side} {part}" for side in SIDES for part in (*ARM, *LEG)]
     if not isinstance(rows, dict):
         raise ValueError(f"{path}: expected lines such as 'left upper arm: JOINT'")
     rows = {str(part): str(joint) for part, joint in rows.items() if joint}
-    unknown = sorted(set(rows) - {"hips", "chest", "neck", "head", *known})
+    unknown = sorted(set(rows) - {*MIDDLE, *SIDED})
     absent = sorted(set(rows.values()) - set(names))
     if unknown:
-        there = ", ".join(("hips", "chest", "neck", "head", *known))
-        raise ValueError(f"{path}: no parts: {', '.join(unknown)}; there are {there}")
+        raise ValueError(f"{path}: no parts: {', '.join(unknown)}; there are {', '.join((*MIDDLE, *SIDED))}")
     if absent:
         raise ValueError(f"{path}: no joints of the recording: {', '.join(absent)}; it has {', '.join(names)}")
-    limbs = {part: names.index(rows[part]) for part in known if part in rows}
-    central = {("", part): names.index(rows[part]) for part in ("hips", "chest", "neck", "head") if part in rows}
+    limbs = {part: names.index(rows[part]) for part in SIDED if part in rows}
+    central = {("", part): names.index(rows[part]) for part in MIDDLE if part in rows}
+    for part, joint in limbs.items():
+        end = limbs.get(end_of(part))
+        if end is not None and (end == joint or joint not in ancestors(end, parents)):
+            raise ValueError(f"{path}: {names[end]}, the {end_of(part)}, does not hang on {names[joint]}, the {part}")
     return _whole(names, parents, limbs, central, str(path), allow)
 
 
 def guess(names: tuple[str, ...], parents: np.ndarray) -> str:
     """Return the text of a mapping file, with the parts that are found and an empty line for each other."""
-    sided = {}
-    for joint, (side, core) in enumerate(map(_split, _without_prefix(names))):
-        sided.setdefault((side, core), joint)
-    limbs = _limbs(sided, parents, ARM, ARMS) | _limbs(sided, parents, LEG, LEGS)
-    rows = {part: sided.get(("", part)) for part in ("hips", "chest", "neck", "head")}
-    rows |= {f"{side} {part}": limbs.get(f"{side} {part}") for side in SIDES for part in (*ARM, *LEG)}
+    limbs, sided = _known(names, parents)
+    rows = {part: sided.get(("", part)) for part in MIDDLE} | {part: limbs.get(part) for part in SIDED}
     lines = [f"{part}: {'' if joint is None else names[joint]}".rstrip() for part, joint in rows.items()]
     return "\n".join([f"# joints of the file: {', '.join(names)}", *lines, ""])
+
+
+def end_of(part: str) -> str:
+    """Return the part at which the bone of an arm or leg ends, such as `left shin` of `left thigh`, or nothing."""
+    side, _, own = part.partition(" ")
+    for limb in (ARM[1:], LEG):
+        if own in limb[:-1]:
+            return f"{side} {limb[limb.index(own) + 1]}"
+    return ""
 
 
 def ancestors(joint: int, parents: np.ndarray) -> list[int]:
@@ -118,6 +146,14 @@ def ancestors(joint: int, parents: np.ndarray) -> list[int]:
     while parents[chain[-1]] >= 0:
         chain.append(int(parents[chain[-1]]))
     return chain
+
+
+def _known(names: tuple[str, ...], parents: np.ndarray) -> tuple[dict[str, int], dict[tuple[str, str], int]]:
+    """Return the joints of the limbs by part, and all joints by side and the rest of their names."""
+    sided = {}
+    for joint, (side, core) in enumerate(map(_split, _without_prefix(names))):
+        sided.setdefault((side, core), joint)
+    return _limbs(sided, parents, ARM, ARMS) | _limbs(sided, parents, LEG, LEGS), sided
 
 
 def _without_prefix(names: tuple[str, ...]) -> list[str]:

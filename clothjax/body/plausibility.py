@@ -5,19 +5,32 @@ import numpy as np
 from clothjax.types import Body, Motion
 
 
-def joint_positions(motion: Motion, body: Body) -> np.ndarray:
-    """Return world positions [T, J, 3] in metres of the body's joints (betas 0) through a clip."""
-    local = np.asarray(motion.rotations, np.float64)
-    joints, parents = np.asarray(body.joints, np.float64), np.asarray(body.parents)
-    rotations, positions = np.empty_like(local), np.empty(local.shape[:3])
+def kinematics(
+    rotations: np.ndarray, path: np.ndarray, offsets: np.ndarray, parents: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return world rotations [T, J, 3, 3] and positions [T, J, 3] of joints, in float64.
+
+    Args:
+        rotations: [T, J, 3, 3] local.
+        path: [T, 3] of the root.
+        offsets: [J, 3] from the parents; that of the root is not used.
+        parents: [J], -1 for the root; parents come first.
+    """
+    world, positions = np.array(rotations, np.float64), np.empty(rotations.shape[:3])
     for j, parent in enumerate(parents):
         if parent < 0:
-            rotations[:, j] = local[:, j]
-            positions[:, j] = joints[j] + np.asarray(motion.translation, np.float64)
+            positions[:, j] = path
         else:
-            rotations[:, j] = rotations[:, parent] @ local[:, j]
-            positions[:, j] = positions[:, parent] + rotations[:, parent] @ (joints[j] - joints[parent])
-    return positions
+            world[:, j] = world[:, parent] @ world[:, j]
+            positions[:, j] = positions[:, parent] + world[:, parent] @ offsets[j]
+    return world, positions
+
+
+def joint_positions(motion: Motion, body: Body) -> np.ndarray:
+    """Return world positions [T, J, 3] in metres of the body's joints (betas 0) through a clip."""
+    joints, parents = np.asarray(body.joints, np.float64), np.asarray(body.parents)
+    path = joints[0] + np.asarray(motion.translation, np.float64)
+    return kinematics(motion.rotations, path, joints - joints[np.maximum(parents, 0)], parents)[1]
 
 
 def bad_frames(motion: Motion, body: Body, limit: float = 0.12) -> np.ndarray:

@@ -17,7 +17,7 @@ from clothjax.body import plausibility, skinning
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.types import Body
-from data_prep import amass, anny, asf_amc, bvh, garment, mesh, procedural, program, retarget, smpl
+from data_prep import amass, anny, asf_amc, bvh, garment, mesh, procedural, program, recording, retarget, smpl
 from data_prep.diffusion import diffuse
 from data_prep.dressing import WINDING
 from data_prep.remesh import remesh
@@ -235,15 +235,15 @@ def test_resampling():
     times = np.arange(25) / 24
     turning = Rotation.from_rotvec(np.outer(times, [0, 5.0, 0])).as_matrix()[:, None]
     path = np.outer(times, [1.0, 2, 3])
-    capture = retarget.Capture(("Hips",), np.array([-1]), np.zeros((1, 3)), turning, path, 24.0)
-    found = retarget.resample(capture, 30.0)
+    capture = recording.Capture(("Hips",), np.array([-1]), np.zeros((1, 3)), turning, path, 24.0)
+    found = recording.resample(capture, 30.0)
     assert len(found.rotations) == 31
     expected = Rotation.from_rotvec(np.outer(np.arange(31) / 30, [0, 5.0, 0])).as_matrix()
     np.testing.assert_allclose(found.rotations[:, 0], expected, atol=1e-9)
     np.testing.assert_allclose(found.translation, np.outer(np.arange(31) / 30, [1.0, 2, 3]), atol=1e-12)
-    np.testing.assert_array_equal(retarget.resample(capture, 12.0).translation, path[::2])
+    np.testing.assert_array_equal(recording.resample(capture, 12.0).translation, path[::2])
     with pytest.raises(ValueError, match="two at least"):
-        retarget.resample(capture._replace(rotations=turning[:1], translation=path[:1]), 30.0)
+        recording.resample(capture._replace(rotations=turning[:1], translation=path[:1]), 30.0)
 
 
 def test_retarget_onto_itself_and_freeze(body, names):
@@ -253,7 +253,7 @@ def test_retarget_onto_itself_and_freeze(body, names):
     twist = Rotation.from_euler("x", 50, degrees=True).as_matrix()
     recorded = motion.rotations.astype(np.float64)
     recorded[:, names.index("LeftHand")] = recorded[:, names.index("LeftHand")] @ twist
-    capture = retarget.Capture(names, body.parents, offsets, recorded, 2 * motion.translation, 30.0)
+    capture = recording.Capture(names, body.parents, offsets, recorded, 2 * motion.translation, 30.0)
     free = retarget.retarget(capture, body, names, freeze=False)
     np.testing.assert_allclose(free.rotations, recorded, atol=1e-6)
     np.testing.assert_allclose(free.translation, motion.translation, atol=0.02)

@@ -195,6 +195,8 @@ def test_an_axis_may_be_said(plain, rig, tmp_path):
     found, _ = retargeted(path, rig, axes=retarget.Axes("y", "x"))
     turned = Rotation.from_euler("y", -90, degrees=True).as_matrix()
     np.testing.assert_allclose(found - found[:, :1], (plain - plain[:, :1]) @ turned.T, atol=1e-4)
+    with pytest.raises(ValueError, match=r"walk\.bvh: y is up, so --forward -y cannot be"):
+        retargeted(path, rig, axes=retarget.Axes(None, "-y"))
 
 
 def test_a_result_that_differs_from_its_recording_is_refused(rig, tmp_path):
@@ -204,7 +206,7 @@ def test_a_result_that_differs_from_its_recording_is_refused(rig, tmp_path):
     of_file, of_body = (
         skeleton.find(*pair) for pair in ((capture.names, capture.parents), (rig.names, rig.body.parents))
     )
-    shown = rest_pose.figure(capture.parents, capture.offsets, capture.rotations, capture.translation)
+    shown = rest_pose.figure(capture, capture.rotations, capture.translation)
     compared = (motion, rig.body, of_body, shown, of_file, "walk.bvh")
     retarget.compare(*compared, 0.0)
     arm = rig.names.index("LeftArm")
@@ -224,11 +226,18 @@ def test_all_that_is_missing_is_told_at_once_and_a_mapping_file_is_begun(rig, tm
     assert "Bone.044" in str(told.value)
     draft = (tmp_path / "walk_joints.yaml").read_text()
     assert "left upper arm:\n" in draft and "left forearm" in draft
+    (tmp_path / "walk_joints.yaml").write_text("# filled in\n")
+    with pytest.raises(ValueError, match=r"walk_joints\.yaml"):
+        program.retarget_as_asked(bvh.read_bvh(path), rig, arguments, path)
+    assert (tmp_path / "walk_joints.yaml").read_text() == "# filled in\n"
     filled = tmp_path / "map.yaml"
     names, parents, _ = skeleton_of(lambda side, part: odd.get(side + part, side + part))
     rows = skeleton.find(*skeleton_of(lambda side, part: side + part)[:2]).limbs
     filled.write_text("\n".join(f"{part}: {names[joint]}" for part, joint in rows.items()) + "\nhead: Bone.001\n")
     assert skeleton.mapped(names, parents, filled).limbs == rows
+    filled.write_text(f"left shin: {names[rows['left thigh']]}\nleft thigh: {names[rows['left shin']]}\n")
+    with pytest.raises(ValueError, match=r"map\.yaml: .*the left shin, does not hang on .*the left thigh"):
+        skeleton.mapped(names, parents, filled)
     filled.write_text("left wing: Bone.012\n")
     with pytest.raises(ValueError, match=r"map\.yaml: no parts: left wing"):
         skeleton.mapped(names, parents, filled)
@@ -253,7 +262,7 @@ def test_byte_order_marks(encoding, plain, rig, tmp_path):
 def test_a_frame_time_in_other_units_is_refused(duration, tmp_path):
     path = dialect(tmp_path / "walk.bvh")
     path.write_text(path.read_text().replace(f"Frame Time: {1 / 30:.7f}", f"Frame Time: {duration}"))
-    with pytest.raises(ValueError, match=r"walk\.bvh: a Frame Time of .* it is in seconds"):
+    with pytest.raises(ValueError, match=r"walk\.bvh, line \d+: a Frame Time of .* it is in seconds"):
         bvh.read_bvh(path)
 
 

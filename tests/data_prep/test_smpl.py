@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.body import plausibility, skinning
 from clothjax.files import storage
 from clothjax.types import Pose
-from data_prep import amass, retarget, smpl
+from data_prep import amass, skeleton, smpl
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +215,7 @@ def test_a_recording_moves_the_embedded_body_possibly(tmp_path):
     assert plausibility.bad_frames(motion, body).size == 0
     places = plausibility.joint_positions(motion, body)
     head, foot, hand, shoulder = (
-        places[:, retarget.cmu_names(names).index(joint)] for joint in ("Head", "LeftFoot", "LeftHand", "LeftArm")
+        places[:, skeleton.cmu_names(names).index(joint)] for joint in ("Head", "LeftFoot", "LeftHand", "LeftArm")
     )
     assert (head[:, 1] - foot[:, 1] > 1.2).all()
     # the arm of a T-pose, lowered by 1.2 rad
