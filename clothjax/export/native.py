@@ -110,7 +110,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     vertices, neighbours = scales.candidates.shape
     yield np.array(
         [vertices, len(mesh.faces), len(mesh.hinges), len(cloth.body), len(predictor.faces), neighbours,
-         predictor.felt is not None, 0],
+         predictor.felt is not None, len(mesh.edges)],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
@@ -127,6 +127,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(rest.hinge_angle)
     yield _padded(predictor.faces.T)
     yield _padded(scales.candidates.T)
+    yield _padded(mesh.edges.T)
     yield _padded(predictor.body)
     yield _padded(cloth.body.T)
     if predictor.felt is not None:

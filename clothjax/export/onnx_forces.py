@@ -10,7 +10,7 @@ import numpy as np
 
 from clothjax.export.onnx_graph import Graph
 from clothjax.networks import psi
-from clothjax.networks.forces import KINDS
+from clothjax.networks.forces import DEPTH, HIGHEST, KINDS
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
@@ -214,7 +214,7 @@ def _bending(g: Graph, model: Model, it: Parts, held: str, hinges: np.ndarray) -
 
 
 def _planes(g: Graph, it: Parts, held: str, transforms: str, advance: str) -> tuple[str, str]:
-    """Points and normals [N, 3, V] of the nearest candidates, as of `forces.felt`."""
+    """Points and normals [N, 3, V] of the nearest candidates, raised, as of `forces.felt`."""
     predictor, cloth = it.predictor, it.cloth
     candidates = np.asarray(predictor.scales.candidates)
     vertices, count = candidates.shape
@@ -233,15 +233,24 @@ def _planes(g: Graph, it: Parts, held: str, transforms: str, advance: str) -> tu
     face = g("GatherElements", every, nearest, axis=2)  # [N, V, 1]
     face = g("Transpose", face, perm=[0, 2, 1])
     face = g("Concat", face, face, face, axis=1)
-    return g("GatherElements", centres, face, axis=2), g("GatherElements", normals, face, axis=2)
+    point, normal = (g("GatherElements", x, face, axis=2) for x in (centres, normals))
+    edges = np.asarray(predictor.mesh.edges)
+    turned, along = (g("Sub", *(g("Gather", x, edges[:, k], axis=2) for k in range(2))) for x in (normal, held))
+    bulge = g("Mul", _dot(g, turned, along), np.float32(1 / 8))
+    bulge = g("Min", g("Relu", bulge), np.float32(HIGHEST))
+    table = _around([edges], vertices)
+    rows = g("Pad", g("Concat", bulge, bulge, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
+    gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 1, *table.shape)
+    raised = g("ReduceMax", gathered, axes=[3], keepdims=0)
+    return g("Add", point, g("Mul", raised, normal)), normal
 
 
 def _contact(g: Graph, model: Model, held: str, point: str, normal: str) -> str:
-    """Forces [N, 3, V] in N of planes that are touched."""
+    """Forces [N, 3, V] in N of planes that are touched, as of `forces.spring`."""
     physics = model.config.physics
     gap = _dot(g, g("Sub", held, point), normal)
     depth = g("Relu", g("Sub", np.float32(physics.collision_offset), gap))
-    return g("Mul", g("Mul", g("Mul", depth, depth), np.float32(3.0 * physics.collision_stiffness)), normal)
+    return g("Mul", g("Mul", depth, np.float32(3.0 * DEPTH * physics.collision_stiffness)), normal)
 
 
 def _pulled_back(g: Graph, model: Model, on_weights: str) -> str:

@@ -17,6 +17,8 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
+#define DEPTH 1e-3f       /* m, at which a plane pushes as hard as the collision energy does */
+#define HIGHEST 0.01f     /* m, by which a plane is raised at most */
 #define DEEPEST 0.02f     /* m, by which a vertex that would be shown in the body is pushed out at most */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
@@ -37,13 +39,13 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 } exact;
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
-    int32_t vertices, triangles, hinges, body, faces, candidates;
+    int32_t vertices, triangles, hinges, body, faces, candidates, edges;
     float timestep, gravity, stiffness, offset;
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
     const float *bend, *angle;                        /* [hinges] */
-    const int32_t *face, *candidate;                  /* [3][faces], [candidates][vertices] */
+    const int32_t *face, *candidate, *edge;           /* [3][faces], [candidates][vertices], [2][edges] */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
     const float *weight;                              /* [moving][vertices] */
     const int32_t *nearest;                           /* [vertices that are shown], the vertex that feels at each */
@@ -80,7 +82,7 @@ struct psi_state {
     int pushed; /* whether the external acceleration was finite */
     float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
     float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
-    float *plane;                                  /* [4], normal and place of what is touched, from the last root */
+    float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it was raised */
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
 
@@ -222,6 +224,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->faces = within(r, head[4], 1, MOST_ELEMENTS);
     f->candidates = within(r, head[5], 1, 1024);
     m->apart = head[6];
+    f->edges = within(r, head[7], 1, MOST_ELEMENTS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
     f->mass = floats(r, padded(f->vertices));
     f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
@@ -233,6 +236,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->angle = floats(r, padded(f->hinges));
     f->face = indices(r, 3 * padded(f->faces), f->body);
     f->candidate = indices(r, f->candidates * padded(f->vertices), f->faces);
+    f->edge = indices(r, 2 * padded(f->edges), f->vertices);
     f->body_weight = floats(r, (size_t)m->moving * padded(f->body));
     f->body_rest = floats(r, 3 * (size_t)padded(f->body));
     f->weight = m->apart ? floats(r, (size_t)m->moving * padded(f->vertices)) : m->weight;
@@ -657,8 +661,8 @@ static void push_momentum(const psi_model *m, psi_state *s, float *restrict forc
     }
 }
 
-/* The plane of the face, of a vertex's candidates, whose centre is nearest pushes it out. */
-static void push_contact(const psi_model *m, psi_state *s, float *force) {
+/* The plane of the face, of a vertex's candidates, whose centre is nearest. */
+static void find_planes(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
     const int32_t wide = padded(f->vertices), faces = padded(f->faces), body = padded(f->body);
     const float *cx = s->centre, *cy = cx + faces, *cz = cy + faces;
@@ -678,7 +682,7 @@ static void push_contact(const psi_model *m, psi_state *s, float *force) {
         }
         for (int i = 0; i < LANES; i++) {
             const int32_t j = nearest[i];
-            float e[3], l[3], normal[3], at[3] = {x[i] - cx[j], y[i] - cy[j], z[i] - cz[j]};
+            float e[3], l[3], normal[3];
             for (int c = 0; c < 3; c++) {
                 const float *p = s->body + c * body;
                 e[c] = p[f->face[faces + j]] - p[f->face[j]];
@@ -687,15 +691,44 @@ static void push_contact(const psi_model *m, psi_state *s, float *force) {
             cross(e, l, normal);
             const float square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
             const float size = square > 1e-30f ? inverse_root(square) : 0.0f;
-            const float gap = size * (at[0] * normal[0] + at[1] * normal[1] + at[2] * normal[2]);
-            const float depth = gap < f->offset ? f->offset - gap : 0.0f;
             float *plane = s->plane + v + i;
-            for (int c = 0; c < 3; c++) {
-                plane[c * wide] = size * normal[c];
-                force[c * wide + v + i] = 3.0f * f->stiffness * depth * depth * plane[c * wide];
-            }
-            plane[3 * wide] = plane[0] * x[i] + plane[wide] * y[i] + plane[2 * wide] * z[i] - gap;
+            for (int c = 0; c < 3; c++) plane[c * wide] = size * normal[c];
+            plane[3 * wide] = plane[0] * cx[j] + plane[wide] * cy[j] + plane[2 * wide] * cz[j];
         }
+    }
+}
+
+/* Raises the planes of an edge's ends by how far the body, if it is round, bulges out between them. */
+static void raise_planes(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const int32_t wide = padded(f->vertices), edges = padded(f->edges);
+    float *raised = s->raised;
+    memset(raised, 0, wide * sizeof(float));
+    for (int32_t e = 0; e < edges; e += LANES) {
+        const int32_t *start = f->edge + e, *end = start + edges;
+        float bulge[LANES] = {0};
+        for (int c = 0; c < 3; c++) {
+            const float *n = s->plane + c * wide, *x = s->held + c * wide;
+            for (int i = 0; i < LANES; i++) bulge[i] += (n[start[i]] - n[end[i]]) * (x[start[i]] - x[end[i]]);
+        }
+        for (int i = 0; i < LANES; i++) {
+            const float b = bulge[i] / 8 < HIGHEST ? bulge[i] / 8 : HIGHEST;
+            if (raised[start[i]] < b) raised[start[i]] = b;
+            if (raised[end[i]] < b) raised[end[i]] = b;
+        }
+    }
+    for (int32_t v = 0; v < wide; v++) s->plane[3 * wide + v] += raised[v];
+}
+
+/* Pushes the garment out of its planes, as springs would. */
+static void push_contact(const psi_model *m, psi_state *s, float *restrict force) {
+    const size_t wide = padded(m->f.vertices);
+    const float *plane = s->plane, *x = s->held, stiffness = 3.0f * DEPTH * m->f.stiffness, offset = m->f.offset;
+    for (size_t v = 0; v < wide; v++) {
+        float gap = -plane[3 * wide + v];
+        for (size_t c = 0; c < 3; c++) gap += plane[c * wide + v] * x[c * wide + v];
+        const float push = gap < offset ? stiffness * (offset - gap) : 0.0f;
+        for (size_t c = 0; c < 3; c++) force[c * wide + v] = push * plane[c * wide + v];
     }
 }
 
@@ -888,6 +921,8 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     memset(elastic, 0, 3 * wide * sizeof(float));
     push_stretching(f, s->held, elastic);
     push_bending(f, s->held, elastic);
+    find_planes(m, s);
+    raise_planes(m, s);
     push_contact(m, s, s->force + 6 * wide);
     pull_back(m, s);
     memcpy(x, s->latent, code * sizeof(float));
@@ -1023,6 +1058,7 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->blended = part(room, &used, 12 * vertices);
     s->force = part(room, &used, 3 * KINDS * vertices);
     s->plane = part(room, &used, 4 * vertices);
+    s->raised = part(room, &used, vertices);
     s->body = part(room, &used, 3 * (size_t)padded(m->f.body));
     s->centre = part(room, &used, 3 * (size_t)padded(m->f.faces));
     for (int k = 0; k < KINDS; k++) s->pulled[k] = part(room, &used, 2 * (size_t)m->widest);

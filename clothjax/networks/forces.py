@@ -14,8 +14,21 @@ from clothjax.types import Array, Contact, Mesh
 
 KINDS = {"momentum": ("inertia", "gravity"), "elasticity": ("stretching", "bending"), "contact": ("collision",)}
 """Terms of the incremental potential that make up each kind of force: momentum is to where the cloth would fly freely.
-Friction, and contact of edges and of cloth with itself, are not felt."""
+Friction, and contact of cloth with itself, are not felt."""
+DEPTH = 1e-3  # m, at which a felt plane pushes as hard as the collision energy does
+HIGHEST = 0.01  # m, by which a plane is raised at most
 SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its largest
+
+
+def spring(distance: Array, offset: float) -> Array:
+    """Quadratic penetration [V] m^3 at signed distances [V] m, whose force at `DEPTH` is that of `energies.collision`.
+
+    A force that grows as the depth does tells how far to move; that of the cubic energy vanishes near the surface.
+    """
+    return 1.5 * DEPTH * jnp.maximum(offset - distance, 0.0) ** 2
+
+
+LAWS = incremental_potential.Laws(collision=spring)
 
 
 def whitening(inverse_hessian: Array) -> Whitening:
@@ -28,20 +41,29 @@ def whitening(inverse_hessian: Array) -> Whitening:
     )
 
 
-def felt(position: Array, surface: tuple[Array, Array], candidates: Array) -> Contact:
+def felt(position: Array, surface: tuple[Array, Array], candidates: Array, edges: Array) -> Contact:
     """Return the planes that Psi feels, for which there is no search: of each vertex's nearest candidate.
+
+    They are raised, so that edges over a round body stay outside of it between their ends: by the height of an arc
+    over its chord, (n_a - n_b) . (x_a - x_b) / 8 for normals n at its ends x. A vertex has that of its highest edge.
 
     Args:
         position: [V, 3] m, the held garment at the next frame.
         surface: centroids [F, 3] m and unit normals [F, 3] of the body's faces at the next frame.
         candidates: [V, K] int32, faces.
+        edges: [E, 2] int32, of the garment.
     """
     points, normals = surface
     nearest, face = jnp.full(len(position), jnp.inf), candidates[:, 0]
     for each in candidates.T:  # an argmin would take several times as long
         apart = sum((position[:, axis] - points[:, axis][each]) ** 2 for axis in range(3))
         nearest, face = jnp.minimum(nearest, apart), jnp.where(apart < nearest, each, face)
-    point, normal = points[face], normals[face]
+    normal = normals[face]
+    start, end = edges.T
+    bulge = jnp.sum((normal[start] - normal[end]) * (position[start] - position[end]), axis=-1) / 8
+    bulge = jnp.minimum(bulge, HIGHEST)
+    raised = jnp.zeros_like(position[:, 0]).at[edges.T].max(bulge)
+    point = points[face] + raised[:, None] * normal
     return Contact(point, point, normal, normal, face)
 
 
@@ -50,12 +72,12 @@ def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConf
 
     Args:
         position: [V, 3] m, the held garment at the next frame.
-        step: the time step, with the contact of `felt`.
+        step: the time step, with the contact of `felt`, which pushes by `spring`.
     """
 
     def force(names: tuple[str, ...]) -> Array:
         def energy(new: Array) -> Array:
-            terms = incremental_potential.energies(new, step, mesh, config)
+            terms = incremental_potential.energies(new, step, mesh, config, LAWS)
             return sum((terms[name] for name in names if name in terms), jnp.zeros(()))
 
         return -jax.grad(energy)(position)
@@ -81,6 +103,6 @@ def reduced(
         candidates: [V, K] int32, as of `felt`.
     """
     position, pullback = jax.vjp(garment, code)
-    step = step._replace(contact=None if surface is None else felt(position, surface, candidates))
+    step = step._replace(contact=None if surface is None else felt(position, surface, candidates, mesh.edges))
     forces = on_vertices(position, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

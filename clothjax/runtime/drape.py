@@ -84,7 +84,7 @@ def predict(
     held = (_skin(rows, drape.garment) + advance[:, None]).T
     body = skinning.pose_corrected(parts.corrections, cloth.body, pose)
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
-    planes = forces.felt(held, contact_search.centroids(posed, parts.faces), parts.scales.candidates)
+    planes = forces.felt(held, contact_search.centroids(posed, parts.faces), parts.scales.candidates, parts.mesh.edges)
     step = TimeStep(
         position=drape.position,
         velocity=incremental_potential.pushed(drape.velocity, timestep, external),

@@ -176,6 +176,7 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
         pytest.skip("needs a C++ compiler")
     model = of_eight_bits(forced[name])
     packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 0))
+    _, template = drape.felt_garment(model)
     errors = {None: [], (50.0, 10.0, -30.0): []}
     for t in range(1, 10):
         for external, rows in errors.items():
@@ -183,15 +184,16 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
             found, vertices = psi_ffi.step(packed, state, at(motion, t), external=pushed)
             expected, shown = inference.step(model, state, at(motion, t), external=pushed)
             change = jnp.linalg.norm(found.drape.change - expected.drape.change)
-            moved = jnp.linalg.norm(expected.drape.velocity, axis=1).mean()
+            hung = jnp.linalg.norm(expected.drape.garment - template, axis=0).mean()
             pairs = [(vertices, shown), *zip(found.drape[2:], expected.drape[2:])]
             pairs.append((found.drape.garment.T, expected.drape.garment.T))
-            apart = [jnp.linalg.norm(x - y, axis=1).mean() / moved for x, y in pairs]
+            apart = [jnp.linalg.norm(x - y, axis=1).mean() / hung for x, y in pairs]
             rows.append([change / jnp.linalg.norm(expected.drape.change), *apart])
         state = expected
     for rows in errors.values():
         of_code, *of_rows = np.median(np.array(rows), axis=0)
-        assert of_code < 0.04 and max(of_rows) < 0.2  # the rows have the rounding of the shapes
+        # the rows have the rounding of the shapes, of which there are few on the other mesh
+        assert of_code < 0.01 and max(of_rows) < {"skip": 0.01, "relu": 0.02, "mesh": 0.15}[name]
 
 
 def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):
@@ -229,7 +231,7 @@ def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path)
     arrays, path = list(native._arrays(forced["mesh"])), tmp_path / "g.psi"
     whole = native.as_bytes(arrays)
     tables = [i for i, array in enumerate(arrays) if array.dtype == np.int32 and array.ndim == 2]
-    assert len(tables) == 4  # corners, hinges, faces of the body, candidates
+    assert len(tables) == 5  # corners, hinges, faces of the body, candidates, edges
     wrong = [whole[:cut] for cut in np.linspace(100, len(whole) - 64, 40).astype(int)]
     for table in tables:
         for value in (-1, 1 << 18):

@@ -73,7 +73,8 @@ def test_vertices_are_its_garment_in_the_world_outside_of_what_it_feels(forced, 
     after, vertices = inference.step(model, before, pose(motion, 2))
     window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
     held = phi.decode(forced.garment, scene, character, before.latent, window, config.model)
-    planes = forces.felt(held, characters.surface(scene, window.following), jnp.asarray(forced.scales.candidates))
+    surface, candidates = characters.surface(scene, window.following), jnp.asarray(forced.scales.candidates)
+    planes = forces.felt(held, surface, candidates, scene.mesh.edges)
     garment = np.asarray(after.drape.position + motion.translation[2][None])
     root, point, normal = (np.asarray(x) for x in (motion.translation[1], planes.point_next, planes.normal_next))
 

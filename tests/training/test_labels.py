@@ -66,14 +66,27 @@ def all_faces(scene):
 
 
 def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem):
-    """Of all terms but friction and contact of edges; with all faces as candidates, contact is HOOD's."""
+    """Of all terms but friction and contact; with all faces as candidates, contact is a spring at HOOD's planes."""
     scene, config, garment, step, window, code = problem
     kinds = reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)))
-    body = window.following.body
-    planes = contact_search.find_at_centroids(garment(code), body, body, scene.body.faces)
+    held, body = np.asarray(garment(code)), window.following.body
+    planes = contact_search.find_at_centroids(held, body, body, scene.body.faces)
+    normals, raised = np.asarray(planes.normal_next), np.zeros(len(held))
+    for a, b in np.asarray(scene.mesh.edges):
+        height = min(float((normals[a] - normals[b]) @ (held[a] - held[b])) / 8, 0.01)
+        raised[a], raised[b] = max(raised[a], height), max(raised[b], height)
     physics = dataclasses.replace(config.physics, without=("friction", "edge_collision"))
-    seen = step._replace(contact=planes)
-    gradient = jax.grad(lambda z: incremental_potential.potential(garment(z), seen, scene.mesh, physics))(code)
+
+    def felt(z):
+        new = garment(z)
+        gap = contact_search.distance(new, planes.point_next, planes.normal_next) - jnp.asarray(raised, jnp.float32)
+        depth = jnp.maximum(config.physics.collision_offset - gap, 0.0)
+        springs = 1.5 * 1e-3 * config.physics.collision_stiffness * jnp.sum(depth**2)
+        bare = step._replace(contact=None, touching=None, edge_contact=None)
+        return springs + incremental_potential.potential(new, bare, scene.mesh, physics)
+
+    assert raised.max() > 1e-3
+    gradient = jax.grad(felt)(code)
     np.testing.assert_allclose(kinds.sum(0), -gradient, atol=1e-4 * float(jnp.abs(gradient).max()))
     assert (np.abs(kinds).max(axis=1) > 0).all()  # each kind is there
     terms = set(incremental_potential.energies(garment(code), step, scene.mesh, config.physics))
@@ -85,7 +98,8 @@ def test_a_vertex_feels_only_its_candidates(problem):
     scene, _, garment, _, window, code = problem
     held, body, faces = garment(code), window.following.body, jnp.asarray(scene.body.faces)
     far = jnp.argmax(jnp.linalg.norm(held[:, None] - contact_search.centroids(body, faces)[0][None], axis=-1), axis=1)
-    contact = forces.felt(held, contact_search.centroids(body, faces), far[:, None].astype(jnp.int32))
+    none = jnp.zeros((1, 2), jnp.int32)  # an edge without length
+    contact = forces.felt(held, contact_search.centroids(body, faces), far[:, None].astype(jnp.int32), none)
     np.testing.assert_array_equal(contact.point_next, contact_search.centroids(body, faces)[0][far])
 
 
