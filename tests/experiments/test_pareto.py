@@ -73,7 +73,7 @@ def test_what_cannot_be_compared(tmp_path):
         report.main(["tshirt", "--part", "inference"])
 
 
-@pytest.fixture(scope="module", params=["ncs", pytest.param("snug", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["ncs", "snug"])
 def run(request, tmp_path_factory):
     """A peer's network trained for a moment, on the t-shirt's mean body."""
     config = settings(request.param, steps=20)
@@ -83,6 +83,7 @@ def run(request, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
     case = variants.prepare([run], ("walk_3",), 10)
     config, model = trained.network(run)
@@ -101,8 +102,8 @@ def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
     assert half <= eighth and half < 0.1 * moved
 
 
-def test_what_was_trained_for_something_else_is_not_compared(run, monkeypatch):
-    config, model = trained.network(run)
+def test_what_was_trained_for_something_else_is_not_compared(monkeypatch):
+    config, model = settings("ncs", steps=20), {}
     physics = dataclasses.replace(config.physics, friction_coefficient=2 * config.physics.friction_coefficient)
     other = dataclasses.replace(config, physics=physics, motions=("run_0",))
     read = {"one": config, "two": other}

@@ -13,8 +13,8 @@ from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes, stage1
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
-# like the quickstart, the same program on another mesh; what test_baselines.py has; one of a minute and a half
-LONG = ("pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_tshirt")
+# what test_experiments.py trains, and the same program on other meshes; what test_baselines.py has; a large network
+LONG = ("quickstart", "pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_tshirt")
 
 
 @pytest.mark.parametrize(
