@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from clothjax.body.plausibility import joint_positions, kinematics
+from clothjax.body.plausibility import body_kinematics, joint_positions
 from clothjax.types import Body, Motion
 from data_prep import skeleton
 from data_prep.recording import Capture, resample
@@ -213,8 +213,7 @@ def from_t_pose(local: dict[str, np.ndarray], body: Body, names: tuple[str, ...]
 
 def stand(motion: Motion, body: Body) -> Motion:
     """Move a motion up or down, so that the body (betas 0) reaches below y = 0 in 2 % of the frames."""
-    offsets = body.joints - body.joints[np.maximum(body.parents, 0)]
-    turned, positions = kinematics(motion.rotations, body.joints[0] + motion.translation, offsets, body.parents)
+    turned, positions = body_kinematics(motion, body)
     shift = positions - np.einsum("tjab,jb->tja", turned, body.joints)
     rows = np.concatenate([turned[:, :, 1], shift[:, :, 1:2]], axis=-1)  # the row of each transform that gives y
     points = np.concatenate([body.vertices, np.ones((len(body.vertices), 1))], axis=1)

@@ -26,11 +26,16 @@ def kinematics(
     return world, positions
 
 
-def joint_positions(motion: Motion, body: Body) -> np.ndarray:
-    """Return world positions [T, J, 3] in metres of the body's joints (betas 0) through a clip."""
+def body_kinematics(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `kinematics` does, of a body (betas 0) through a clip, in metres."""
     joints, parents = np.asarray(body.joints, np.float64), np.asarray(body.parents)
     path = joints[0] + np.asarray(motion.translation, np.float64)
-    return kinematics(np.asarray(motion.rotations), path, joints - joints[np.maximum(parents, 0)], parents)[1]
+    return kinematics(np.asarray(motion.rotations), path, joints - joints[np.maximum(parents, 0)], parents)
+
+
+def joint_positions(motion: Motion, body: Body) -> np.ndarray:
+    """Return world positions [T, J, 3] in metres of the body's joints (betas 0) through a clip."""
+    return body_kinematics(motion, body)[1]
 
 
 def bad_frames(motion: Motion, body: Body, limit: float = 0.12) -> np.ndarray:

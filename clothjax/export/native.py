@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import sidecar
-from clothjax.networks import psi
+from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
 from clothjax.physics.energies import GRAVITY, THICKNESS
@@ -107,14 +107,16 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         raise ValueError(f"plain C takes {MOST_WIDTH // 3} vertices of a garment with forces, not {len(cloth.mass)}")
     felt, template = drape.felt_garment(model)
     mesh, rest, scales = predictor.mesh, cloth.rest, predictor.scales
+    edges = np.asarray(forces.touching_edges(mesh, physics))
     vertices, neighbours = scales.candidates.shape
     yield np.array(
         [vertices, len(mesh.faces), len(mesh.hinges), len(cloth.body), len(predictor.faces), neighbours,
-         predictor.felt is not None, len(mesh.edges)],
+         predictor.felt is not None, len(edges)],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
-    yield np.array([1 / model.config.fps, weight, physics.collision_stiffness, physics.collision_offset], np.float32)
+    spring = 3.0 * forces.DEPTH * physics.collision_stiffness  # N/m
+    yield np.array([1 / model.config.fps, weight, spring, physics.collision_offset], np.float32)
     size = np.asarray(rest.face_area) * THICKNESS
     stiffness = 0.0 if "bending" in physics.without else np.asarray(cloth.material.bending)
     yield _padded(cloth.mass)
@@ -127,7 +129,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(rest.hinge_angle)
     yield _padded(predictor.faces.T)
     yield _padded(scales.candidates.T)
-    yield _padded(mesh.edges.T)
+    yield _padded(edges.T)
     yield _padded(predictor.body)
     yield _padded(cloth.body.T)
     if predictor.felt is not None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from clothjax.export.onnx_graph import Graph
 from clothjax.networks import psi
-from clothjax.networks.forces import DEPTH, HIGHEST, KINDS
+from clothjax.networks.forces import DEPTH, HIGHEST, KINDS, touching_edges
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
@@ -71,7 +71,8 @@ def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) 
     """
     it = parts(model)
     held = g("Add", moved(g, rows, "garment"), advance)
-    planes = _planes(g, it, held, transforms, advance)
+    edges = np.asarray(touching_edges(it.predictor.mesh, model.config.physics))
+    planes = _planes(g, it, edges, held, transforms, advance)
     kinds = [
         _momentum(g, model, it, held),
         _elasticity(g, model, it, held),
@@ -213,7 +214,7 @@ def _bending(g: Graph, model: Model, it: Parts, held: str, hinges: np.ndarray) -
     return [g("Sub", at_start, longer), g("Add", at_end, longer), *tips]
 
 
-def _planes(g: Graph, it: Parts, held: str, transforms: str, advance: str) -> tuple[str, str]:
+def _planes(g: Graph, it: Parts, edges: np.ndarray, held: str, transforms: str, advance: str) -> tuple[str, str]:
     """Points and normals [N, 3, V] of the nearest candidates, raised, as of `forces.felt`."""
     predictor, cloth = it.predictor, it.cloth
     candidates = np.asarray(predictor.scales.candidates)
@@ -234,7 +235,8 @@ def _planes(g: Graph, it: Parts, held: str, transforms: str, advance: str) -> tu
     face = g("Transpose", face, perm=[0, 2, 1])
     face = g("Concat", face, face, face, axis=1)
     point, normal = (g("GatherElements", x, face, axis=2) for x in (centres, normals))
-    edges = np.asarray(predictor.mesh.edges)
+    if len(edges) == 0:
+        return point, normal
     turned, along = (g("Sub", *(g("Gather", x, edges[:, k], axis=2) for k in range(2))) for x in (normal, held))
     bulge = g("Mul", _dot(g, turned, along), np.float32(1 / 8))
     bulge = g("Min", g("Relu", bulge), np.float32(HIGHEST))

@@ -17,7 +17,6 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
-#define DEPTH 1e-3f       /* m, at which a plane pushes as hard as the collision energy does */
 #define HIGHEST 0.01f     /* m, by which a plane is raised at most */
 #define DEEPEST 0.02f     /* m, by which a vertex that would be shown in the body is pushed out at most */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
@@ -40,7 +39,7 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
     int32_t vertices, triangles, hinges, body, faces, candidates, edges;
-    float timestep, gravity, stiffness, offset;
+    float timestep, gravity, stiffness, offset;       /* the last two of planes that are touched, in N/m and m */
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
@@ -224,7 +223,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->faces = within(r, head[4], 1, MOST_ELEMENTS);
     f->candidates = within(r, head[5], 1, 1024);
     m->apart = head[6];
-    f->edges = within(r, head[7], 1, MOST_ELEMENTS);
+    f->edges = within(r, head[7], 0, MOST_ELEMENTS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
     f->mass = floats(r, padded(f->vertices));
     f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
@@ -723,7 +722,7 @@ static void raise_planes(const psi_model *m, psi_state *s) {
 /* Pushes the garment out of its planes, as springs would. */
 static void push_contact(const psi_model *m, psi_state *s, float *restrict force) {
     const size_t wide = padded(m->f.vertices);
-    const float *plane = s->plane, *x = s->held, stiffness = 3.0f * DEPTH * m->f.stiffness, offset = m->f.offset;
+    const float *plane = s->plane, *x = s->held, stiffness = m->f.stiffness, offset = m->f.offset;
     for (size_t v = 0; v < wide; v++) {
         float gap = -plane[3 * wide + v];
         for (size_t c = 0; c < 3; c++) gap += plane[c * wide + v] * x[c * wide + v];

@@ -41,6 +41,11 @@ def whitening(inverse_hessian: Array) -> Whitening:
     )
 
 
+def touching_edges(mesh: Mesh, config: PhysicsConfig) -> Array:
+    """Return the edges [E, 2] of a garment that touch the body between their ends: all, or none."""
+    return mesh.edges if config.edge_contact else mesh.edges[:0]
+
+
 def felt(position: Array, surface: tuple[Array, Array], candidates: Array, edges: Array) -> Contact:
     """Return the planes that Psi feels, for which there is no search: of each vertex's nearest candidate.
 
@@ -51,7 +56,7 @@ def felt(position: Array, surface: tuple[Array, Array], candidates: Array, edges
         position: [V, 3] m, the held garment at the next frame.
         surface: centroids [F, 3] m and unit normals [F, 3] of the body's faces at the next frame.
         candidates: [V, K] int32, faces.
-        edges: [E, 2] int32, of the garment.
+        edges: [E, 2] int32, of `touching_edges`.
     """
     points, normals = surface
     nearest, face = jnp.full(len(position), jnp.inf), candidates[:, 0]
@@ -103,6 +108,7 @@ def reduced(
         candidates: [V, K] int32, as of `felt`.
     """
     position, pullback = jax.vjp(garment, code)
-    step = step._replace(contact=None if surface is None else felt(position, surface, candidates, mesh.edges))
+    edges = touching_edges(mesh, config)
+    step = step._replace(contact=None if surface is None else felt(position, surface, candidates, edges))
     forces = on_vertices(position, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from clothjax.config import PhysicsConfig
+from clothjax.geometry.vectors import norm
 from clothjax.physics import contact_search, energies, incremental_potential
 from clothjax.physics.incremental_potential import LAWS, Laws, TimeStep
 from clothjax.types import Array, Mesh, Scalar
@@ -265,10 +266,7 @@ def _bending_semidefinite(hinges: Array, step: TimeStep) -> Array:
     """Gauss-Newton Hessian [H, 4, 3, 4, 3] N/m of bending: k / (4 A) r'^T r' with r = l (theta - theta_0)."""
 
     def residual(points, rest_angle):
-        edge = points[1] - points[0]
-        squared = jnp.sum(edge * edge)
-        length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-        return jnp.where(squared > 0, length, 0.0) * (energies.dihedral_angle(points[None])[0] - rest_angle)
+        return norm(points[1] - points[0]) * (energies.dihedral_angle(points[None])[0] - rest_angle)
 
     slope = jax.vmap(jax.grad(residual))(hinges, step.rest.hinge_angle)
     stiffness = step.material.bending / (4.0 * step.rest.hinge_area)

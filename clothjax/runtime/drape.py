@@ -84,7 +84,8 @@ def predict(
     held = (_skin(rows, drape.garment) + advance[:, None]).T
     body = skinning.pose_corrected(parts.corrections, cloth.body, pose)
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
-    planes = forces.felt(held, contact_search.centroids(posed, parts.faces), parts.scales.candidates, parts.mesh.edges)
+    surface, edges = contact_search.centroids(posed, parts.faces), forces.touching_edges(parts.mesh, config.physics)
+    planes = forces.felt(held, surface, parts.scales.candidates, edges)
     step = TimeStep(
         position=drape.position,
         velocity=incremental_potential.pushed(drape.velocity, timestep, external),

@@ -141,9 +141,9 @@ def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
 
 @pytest.fixture(scope="module")
 def forced():
-    """Models of a random Psi with forces: a skip, a ReLU on the weights, and another mesh with few shapes."""
-    skip, relu = random_force_psi(), random_force_psi(skip=False, without=("bending",))
-    mesh = specialise.on_mesh(relu.model(), relu.experiment.garment, np.zeros(10))
+    """Models of a random Psi with forces: a skip; a ReLU and no contact of edges; the first on another mesh."""
+    skip, relu = random_force_psi(), random_force_psi(skip=False, without=("bending",), edge_contact=False)
+    mesh = specialise.on_mesh(skip.model(), skip.experiment.garment, np.zeros(10))
     return {
         "skip": specialise.specialise(skip.model(betas=np.ones(10))),
         "relu": relu.model(material=Material(0.2, 2e4, 4e4, 10.0)),  # its bending is left out, or nothing else counts
@@ -176,7 +176,6 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
         pytest.skip("needs a C++ compiler")
     model = of_eight_bits(forced[name])
     packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 0))
-    _, template = drape.felt_garment(model)
     errors = {None: [], (50.0, 10.0, -30.0): []}
     for t in range(1, 10):
         for external, rows in errors.items():
@@ -184,16 +183,14 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
             found, vertices = psi_ffi.step(packed, state, at(motion, t), external=pushed)
             expected, shown = inference.step(model, state, at(motion, t), external=pushed)
             change = jnp.linalg.norm(found.drape.change - expected.drape.change)
-            hung = jnp.linalg.norm(expected.drape.garment - template, axis=0).mean()
             pairs = [(vertices, shown), *zip(found.drape[2:], expected.drape[2:])]
             pairs.append((found.drape.garment.T, expected.drape.garment.T))
-            apart = [jnp.linalg.norm(x - y, axis=1).mean() / hung for x, y in pairs]
+            apart = [jnp.linalg.norm(x - y, axis=1).mean() for x, y in pairs]
             rows.append([change / jnp.linalg.norm(expected.drape.change), *apart])
         state = expected
     for rows in errors.values():
         of_code, *of_rows = np.median(np.array(rows), axis=0)
-        # the rows have the rounding of the shapes, of which there are few on the other mesh
-        assert of_code < 0.01 and max(of_rows) < {"skip": 0.01, "relu": 0.02, "mesh": 0.15}[name]
+        assert of_code < 0.01 and max(of_rows) < 1.5e-3  # m; the rows have the rounding of shapes and decoder
 
 
 def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):

@@ -56,23 +56,24 @@ def problem(toy):
     return scene, config, lambda z: garment(latent=z), step, window, code
 
 
-def reduced(garment, code, step, window, scene, candidates):
+def reduced(garment, code, step, window, scene, candidates, **physics):
     surface = characters.surface(scene, window.following)
-    return forces.reduced(garment, code, step, surface, candidates, scene.mesh, PhysicsConfig())
+    return forces.reduced(garment, code, step, surface, candidates, scene.mesh, PhysicsConfig(**physics))
 
 
 def all_faces(scene):
     return np.broadcast_to(np.arange(len(scene.body.faces)), (len(scene.garment.vertices), len(scene.body.faces)))
 
 
-def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem):
+@pytest.mark.parametrize("edges", [True, False])
+def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem, edges):
     """Of all terms but friction and contact; with all faces as candidates, contact is a spring at HOOD's planes."""
     scene, config, garment, step, window, code = problem
-    kinds = reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)))
+    kinds = reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)), edge_contact=edges)
     held, body = np.asarray(garment(code)), window.following.body
     planes = contact_search.find_at_centroids(held, body, body, scene.body.faces)
     normals, raised = np.asarray(planes.normal_next), np.zeros(len(held))
-    for a, b in np.asarray(scene.mesh.edges):
+    for a, b in np.asarray(scene.mesh.edges) if edges else ():
         height = min(float((normals[a] - normals[b]) @ (held[a] - held[b])) / 8, 0.01)
         raised[a], raised[b] = max(raised[a], height), max(raised[b], height)
     physics = dataclasses.replace(config.physics, without=("friction", "edge_collision"))
@@ -85,7 +86,7 @@ def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem):
         bare = step._replace(contact=None, touching=None, edge_contact=None)
         return springs + incremental_potential.potential(new, bare, scene.mesh, physics)
 
-    assert raised.max() > 1e-3
+    assert (raised.max() > 1e-3) == edges
     gradient = jax.grad(felt)(code)
     np.testing.assert_allclose(kinds.sum(0), -gradient, atol=1e-4 * float(jnp.abs(gradient).max()))
     assert (np.abs(kinds).max(axis=1) > 0).all()  # each kind is there
