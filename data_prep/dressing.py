@@ -77,9 +77,9 @@ def limbs(body: Body, names: tuple[str, ...], parts: tuple[str, ...], share: flo
 
 
 def highest_opening(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the vertices [V] bool on the highest boundary loop of a mesh that has one."""
+    """Return the vertices [V] bool on the boundary loop of a mesh that reaches highest; there must be one."""
     highest = np.zeros(len(vertices), bool)
-    highest[max(boundary_loops(faces), key=lambda loop: vertices[loop, 1].mean())] = True
+    highest[max(boundary_loops(faces), key=lambda loop: vertices[loop, 1].max())] = True
     return highest
 
 

@@ -9,14 +9,11 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
-from clothjax.files.storage import FACTORS
-from clothjax.geometry.topology import boundary_loops, boundary_mask, components
-from clothjax.render import ray_cast
+from clothjax.geometry.topology import boundary_loops, components
 from clothjax.types import Body, Garment
-from data_prep import mesh_file
+from data_prep import marks, mesh_file
 from data_prep.dressing import FOREARM, WINDING, dress, limbs, push_out
 from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
@@ -29,8 +26,6 @@ DEEP, MAX_DEEP_SHARE = 0.03, 0.15  # m inside the body; a larger share of such v
 MIN_VERTICES, MAX_VERTICES = 100, 20_000
 DIFFUSION_SAMPLES = 500  # for each vertex of a loose garment
 FARTHEST_PUSH = 0.03  # m, by which a garment that is worn is pushed out of the body at most
-MOST_OF_HEIGHT = 0.4  # of the garment's, that an opening to pin may take up
-PIN_COLOUR = (0.85, 0.1, 0.1)
 
 
 class Answers(NamedTuple):
@@ -57,9 +52,9 @@ class Working(NamedTuple):
     cloth: np.ndarray | None = None  # [V, 3] factors of density, stretching and bending
     log: tuple[str, ...] = ()  # a line for each change
 
-    def logged(self, line: str) -> "Working":
-        """Return the same garment with one more line in its log."""
-        return self._replace(log=(*self.log, line))
+    def logged(self, *lines: str) -> "Working":
+        """Return the same garment with more lines in its log."""
+        return self._replace(log=(*self.log, *lines))
 
 
 def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers) -> tuple[Garment, tuple[str, ...]]:
@@ -84,8 +79,13 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     check_objects(path, mesh, placed, surface)
     working, index = _clean(path, placed, mesh.faces)
     working, index = _sew(path, working, index, answers)
-    working = _pin_marked(path, working, mesh, index, answers.pin)
-    working = _assign_cloth(path, working, mesh, index, answers.cloth)
+    at_place = marks.is_place(answers.pin)
+    if not at_place:
+        members = index[marks.marked(path, mesh, answers.pin, "--pin")]
+        working = working._replace(pinned=np.isin(np.arange(len(working.vertices)), members))
+    if answers.cloth:
+        cloth, lines = marks.cloth(path, mesh, index, len(working.vertices), answers.cloth)
+        working = working._replace(cloth=cloth).logged(*lines)
     working = _orient(path, working, surface, answers.flip)
     if answers.vertices:
         working = _resample(working, answers.vertices)
@@ -101,10 +101,9 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
         f"{'loose' if loose else 'tight'}: {1e3 * distance:.0f} mm from the body in the middle, so skin and "
         f"shape are those of the body {'around' if loose else 'nearest to'} each vertex"
     )
-    if answers.pin == "highest":
-        working = _pin_highest_opening(path, working)
-    elif answers.pin.startswith("above:"):
-        working = _pin_above(path, working, answers.pin.removeprefix("above:"))
+    if at_place:
+        pinned = marks.pinned_at(path, working.vertices, working.faces, answers.pin)
+        working = working._replace(pinned=pinned)
     working = _log_counts(working)
     vertices, faces, pinned, cloth, log = working
     hidden = _uncovered_arms(vertices, body, names)
@@ -179,58 +178,6 @@ def _sew(path: str | Path, working: Working, index: np.ndarray, answers: Answers
     if splits:
         working = working.logged(f"sewn: {splits} vertices lay on edges of another border")
     return working, np.where(index < 0, -1, joined[index])
-
-
-def _marked(path: str | Path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
-    """Return which of the file's vertices [V] bool are marked there, by a colour or as an object."""
-    if what == "red":
-        if not mesh.red.any():
-            raise ValueError(
-                f"{path}: {flag} red, but no vertex is painted red (.ply and .glb keep colours of vertices)"
-            )
-        return mesh.red
-    if what.startswith("object:"):
-        name = what.removeprefix("object:")
-        if name not in mesh.objects:
-            raise ValueError(f"{path}: has no object {name!r} for {flag}; there are: {', '.join(mesh.objects)}")
-        return mesh.objects[name]
-    known = "none, highest, above:HEIGHT, red or object:NAME" if flag == "--pin" else "red=... or object:NAME=..."
-    raise ValueError(f"{flag} {what}: choose {known}")
-
-
-def _pin_marked(path: str | Path, working: Working, mesh: Mesh, index: np.ndarray, pin: str) -> Working:
-    """Pin the vertices that the file marks; none for what is a place. `index` is that of `_clean`."""
-    if pin in ("none", "highest") or pin.startswith("above:"):
-        return working
-    marked = index[_marked(path, mesh, pin, "--pin")]
-    return working._replace(pinned=np.isin(np.arange(len(working.vertices)), marked))
-
-
-def _assign_cloth(
-    path: str | Path, working: Working, mesh: Mesh, index: np.ndarray, regions: tuple[str, ...]
-) -> Working:
-    """Set the cloth's factors in regions WHAT=DENSITY,STRETCHING,BENDING; a later one covers an earlier one."""
-    if not regions:
-        return working
-    factors, (low, high) = np.ones((len(working.vertices), 3)), FACTORS
-    for region in regions:
-        what, _, numbers = region.rpartition("=")
-        try:
-            values = np.array([float(x) for x in numbers.split(",")])
-        except ValueError:
-            values = np.zeros(0)
-        if len(values) != 3 or not ((values >= low) & (values <= high)).all():
-            raise ValueError(
-                f"--cloth {region}: give WHAT=DENSITY,STRETCHING,BENDING, each how many times as much as elsewhere, "
-                f"from {low} to {high}, as red=1,4,10"
-            )
-        members = np.setdiff1d(index[_marked(path, mesh, what, "--cloth")], [-1])
-        factors[members] = values
-        working = working.logged(
-            f"{what}: {len(members)} vertices with {values[0]:g} times the weight, {values[1]:g} times the stiffness, "
-            f"{values[2]:g} times that of bending"
-        )
-    return working._replace(cloth=factors)
 
 
 def _orient(path: str | Path, working: Working, surface: Surface, flip: bool) -> Working:
@@ -308,36 +255,6 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
     )
 
 
-def _pin_highest_opening(path: str | Path, working: Working) -> Working:
-    """Pin the highest boundary loop; refuse one that also runs far down, as along an open front."""
-    vertices = working.vertices
-    if not boundary_loops(working.faces):
-        raise ValueError(f"{path}: closed, it has no opening to pin: use --pin none, red or object:NAME")
-    pinned = np.zeros(len(vertices), bool)
-    pinned[max(boundary_loops(working.faces), key=lambda loop: vertices[loop, 1].max())] = True
-    heights, whole = vertices[pinned, 1], np.ptp(vertices[:, 1])
-    if np.ptp(heights) > MOST_OF_HEIGHT * whole:
-        raise ValueError(
-            f"{path}: its highest border runs from {heights.max():.2f} down to {heights.min():.2f} m, as of an open "
-            "front or a seam that is not sewn: pin it above a height, as with --pin "
-            f"above:{heights.max() - 0.1 * whole:.2f}, paint it red (--pin red), or sew the seam (--sew MM)"
-        )
-    return working._replace(pinned=pinned)
-
-
-def _pin_above(path: str | Path, working: Working, text: str) -> Working:
-    """Pin the vertices of borders above a height in m."""
-    try:
-        height = float(text)
-    except ValueError:
-        raise ValueError(f"--pin above:{text}: give a height in m, such as above:0.45") from None
-    vertices = working.vertices
-    pinned = boundary_mask(working.faces, len(vertices)) & (vertices[:, 1] > height)
-    if not pinned.any():
-        raise ValueError(f"{path}: no border is above {height} m; the highest is at {vertices[:, 1].max():.2f} m")
-    return working._replace(pinned=pinned)
-
-
 def _log_counts(working: Working) -> Working:
     """Log the number of vertices, faces, parts, openings and pins."""
     vertices, faces, pinned = working.vertices, working.faces, working.pinned
@@ -357,25 +274,3 @@ def _uncovered_arms(points: np.ndarray, body: Body, names: tuple[str, ...]) -> n
     distance, nearest = cKDTree(body.vertices).query(points)
     covered = (arms[nearest] & (distance < LOOSE_DISTANCE)).mean() > 0.01
     return arms & ~covered
-
-
-def draw(path: str | Path, garment: Garment, body: Body) -> None:
-    """Draw the garment on the body from four sides, pinned vertices as red dots; needs the extra `render`."""
-    surfaces = [
-        ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN),
-        ray_cast.Surface(garment.vertices, garment.faces),
-    ]
-    dot = trimesh.creation.icosphere(1, 0.006)
-    places = garment.vertices[garment.pinned]
-    if len(places):
-        dots = (places[:, None] + np.asarray(dot.vertices)[None]).reshape(-1, 3)
-        faces = (len(dot.vertices) * np.arange(len(places))[:, None, None] + np.asarray(dot.faces)[None]).reshape(-1, 3)
-        surfaces.append(ray_cast.Surface(dots, faces, PIN_COLOUR))
-    views = ("front", "three-quarter", "side", "back")
-    try:
-        size = np.ptp(garment.vertices, axis=0)
-        margin = 1.2 * max(1.0, 4 / 3 * size[[0, 2]].max() / size[1])
-        pictures = [ray_cast.render(surfaces, ray_cast.camera_for(garment.vertices, view, margin)) for view in views]
-        ray_cast.comparison(path, {"": pictures}, views)
-    except ImportError as error:
-        print(f"{path}: not drawn ({error})")

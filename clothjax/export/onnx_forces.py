@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export.onnx_graph import Graph
-from clothjax.networks import psi
-from clothjax.networks.forces import DEPTH, HIGHEST, KINDS, touching_edges
+from clothjax.networks import forces, psi
+from clothjax.networks.forces import KINDS
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
@@ -71,7 +71,7 @@ def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) 
     """
     it = parts(model)
     held = g("Add", moved(g, rows, "garment"), advance)
-    edges = np.asarray(touching_edges(it.predictor.mesh, model.config.physics))
+    edges = np.asarray(forces.touching_edges(it.predictor.mesh, model.config.physics))
     planes = _planes(g, it, edges, held, transforms, advance)
     kinds = [
         _momentum(g, model, it, held),
@@ -239,7 +239,7 @@ def _planes(g: Graph, it: Parts, edges: np.ndarray, held: str, transforms: str, 
         return point, normal
     turned, along = (g("Sub", *(g("Gather", x, edges[:, k], axis=2) for k in range(2))) for x in (normal, held))
     bulge = g("Mul", _dot(g, turned, along), np.float32(1 / 8))
-    bulge = g("Min", g("Relu", bulge), np.float32(HIGHEST))
+    bulge = g("Min", g("Relu", bulge), np.float32(forces.HIGHEST))
     table = _around([edges], vertices)
     rows = g("Pad", g("Concat", bulge, bulge, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
     gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 1, *table.shape)
@@ -252,7 +252,7 @@ def _contact(g: Graph, model: Model, held: str, point: str, normal: str) -> str:
     physics = model.config.physics
     gap = _dot(g, g("Sub", held, point), normal)
     depth = g("Relu", g("Sub", np.float32(physics.collision_offset), gap))
-    return g("Mul", g("Mul", depth, np.float32(3.0 * DEPTH * physics.collision_stiffness)), normal)
+    return g("Mul", g("Mul", depth, np.float32(3.0 * forces.DEPTH * physics.collision_stiffness)), normal)
 
 
 def _pulled_back(g: Graph, model: Model, on_weights: str) -> str:

@@ -17,8 +17,6 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
-#define HIGHEST 0.01f     /* m, by which a plane is raised at most */
-#define DEEPEST 0.02f     /* m, by which a vertex that would be shown in the body is pushed out at most */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
@@ -39,7 +37,8 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
     int32_t vertices, triangles, hinges, body, faces, candidates, edges;
-    float timestep, gravity, stiffness, offset;       /* the last two of planes that are touched, in N/m and m */
+    float timestep, gravity;
+    float stiffness, offset, highest, deepest;        /* of planes that are touched: in N/m; m; raised, pushed at most */
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
@@ -214,7 +213,7 @@ static exact read_exact(reader *r, psi_model *m) {
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
     const int32_t *head = integers(r, 8);
-    const float *rates = floats(r, 4);
+    const float *rates = floats(r, 6);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
     f->triangles = within(r, head[1], 0, MOST_ELEMENTS);
@@ -225,6 +224,7 @@ static void read_forces(reader *r, psi_model *m) {
     m->apart = head[6];
     f->edges = within(r, head[7], 0, MOST_ELEMENTS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
+    f->highest = rates[4], f->deepest = rates[5];
     f->mass = floats(r, padded(f->vertices));
     f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
     f->inverse = floats(r, 4 * (size_t)padded(f->triangles));
@@ -711,7 +711,7 @@ static void raise_planes(const psi_model *m, psi_state *s) {
             for (int i = 0; i < LANES; i++) bulge[i] += (n[start[i]] - n[end[i]]) * (x[start[i]] - x[end[i]]);
         }
         for (int i = 0; i < LANES; i++) {
-            const float b = bulge[i] / 8 < HIGHEST ? bulge[i] / 8 : HIGHEST;
+            const float b = bulge[i] / 8 < f->highest ? bulge[i] / 8 : f->highest;
             if (raised[start[i]] < b) raised[start[i]] = b;
             if (raised[end[i]] < b) raised[end[i]] = b;
         }
@@ -973,7 +973,7 @@ static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
         const float *plane = s->plane + (m->apart ? m->f.nearest[v] : v);
         float *x = vertices + 3 * v, gap = -plane[3 * wide];
         for (int c = 0; c < 3; c++) gap += plane[c * wide] * (x[c] - last[c]);
-        const float depth = gap < m->f.offset ? m->f.offset - gap : 0.0f, push = depth < DEEPEST ? depth : DEEPEST;
+        const float depth = gap < m->f.offset ? m->f.offset - gap : 0.0f, push = depth < m->f.deepest ? depth : m->f.deepest;
         for (int c = 0; c < 3; c++) x[c] += push * plane[c * wide];
     }
 }

@@ -12,7 +12,7 @@ from clothjax.files import storage
 from clothjax.progress import progress_bar
 from clothjax.simulation import assembly, scene
 from clothjax.training import stage1
-from data_prep import garment
+from data_prep import templates
 from experiments.benchmark.timing import interleaved, program
 
 matplotlib.use("Agg")
@@ -27,7 +27,7 @@ def measure(config: Config, rounds: int, sizes: tuple[int, ...]) -> dict:
     programs, clips = {}, None
     with progress_bar("compiling for each size", len(sizes)) as report:
         for done, size in enumerate(sizes):
-            cloth = garment.build("tshirt", size, body, names)
+            cloth = templates.build("tshirt", size, body, names)
             built = scene.build_scene(cloth, body, config)
             experiment = assembly.Experiment(config, names, body, cloth, built)
             clips = clips or assembly.training_clips(experiment)[0]

@@ -17,7 +17,20 @@ from clothjax.body import plausibility, skinning
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.types import Body
-from data_prep import amass, anny, asf_amc, bvh, garment, mesh, procedural, program, recording, retarget, smpl
+from data_prep import (
+    amass,
+    anny,
+    asf_amc,
+    bvh,
+    garment,
+    mesh,
+    procedural,
+    program,
+    recording,
+    retarget,
+    smpl,
+    templates,
+)
 from data_prep.diffusion import diffuse
 from data_prep.dressing import WINDING
 from data_prep.remesh import remesh
@@ -434,7 +447,7 @@ def test_what_is_not_pinned_is_blurred_as_ever(samples):
 @pytest.mark.parametrize("name", ["pants_1000", "pants_4000", "built"])
 def test_pinned_waists_stay_outside_of_who_bends(name, body, names):
     """A slim and a middling wearer who sit and lean forwards; a heavy one's belly would be within the thighs."""
-    worn = garment.build("skirt", 300, body, names) if name == "built" else storage.load_garment(name, body)
+    worn = templates.build("skirt", 300, body, names) if name == "built" else storage.load_garment(name, body)
     rotations = np.tile(np.eye(3, dtype=np.float32), (len(names), 1, 1))
     for joint, degrees in {"LowerBack": 30, "LeftUpLeg": -60, "RightUpLeg": -60}.items():
         rotations[names.index(joint)] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
@@ -468,7 +481,7 @@ def test_skirt_template(tmp_path, body, names):
 
 
 def test_long_sleeves_go_along_the_forearms(body, names):
-    shirt = garment.build("longsleeve", 400, body, names)
+    shirt = templates.build("longsleeve", 400, body, names)
     for side in ("Left", "Right"):
         fore, hand = (np.asarray(body.joints[names.index(side + bone)]) for bone in ("ForeArm", "Hand"))
         along = (shirt.vertices - fore) @ (hand - fore) / np.sum((hand - fore) ** 2)
@@ -493,9 +506,9 @@ def test_garment_from_a_mesh(tmp_path, body):
 
 def test_template_refuses(body, names):
     with pytest.raises(ValueError, match="tshirt"):
-        garment.build("cape", 100, body, names)
+        templates.build("cape", 100, body, names)
     with pytest.raises(ValueError, match="LowerBack"):
-        garment.build("skirt", 100, body, tuple(n.replace("LowerBack", "b1") for n in names))
+        templates.build("skirt", 100, body, tuple(n.replace("LowerBack", "b1") for n in names))
 
 
 # The body

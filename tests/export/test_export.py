@@ -20,6 +20,7 @@ from clothjax.body import skinning
 from clothjax.commands import convert
 from clothjax.export import frame, litert, native, onnx, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
+from clothjax.networks import forces
 from clothjax.runtime import inference, specialise
 from clothjax.types import Material, Motion, Pose
 
@@ -298,6 +299,19 @@ def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_pa
     several = onnx.to_onnx(model, tmp_path / "n.onnx", batch=None, output="none")
     names = {x.name for x in session(several).get_outputs()}
     assert {"next_garment", "next_velocity", "ok"} <= names and "vertices" not in names
+
+
+def test_onnx_of_forces_raises_planes_as_far_as_jax(forced, motion, tmp_path, monkeypatch):
+    """By 2 mm at most: few are raised by the centimetre that is set."""
+    clip = Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
+    usual, _ = inference.animate(forced["skip"], clip)
+    monkeypatch.setattr(forces, "HIGHEST", 0.002)
+    jax.clear_caches()  # it is a constant of compiled programs
+    found = onnx.run_onnx(onnx.to_onnx(forced["skip"], tmp_path / "g.onnx"), forced["skip"], clip)
+    assert apart(found, forced["skip"], clip).max() < 2e-4
+    assert np.abs(found - np.asarray(usual)).max() > 1e-3
+    monkeypatch.undo()
+    jax.clear_caches()
 
 
 def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):

@@ -16,6 +16,7 @@ import clothjax as cj
 from clothjax.body import skinning
 from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
+from clothjax.files import storage
 from clothjax.networks import forces
 from clothjax.runtime import drape, inference, models, specialise
 from clothjax.runtime.models import Layer, State
@@ -141,9 +142,10 @@ def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
 
 @pytest.fixture(scope="module")
 def forced():
-    """Models of a random Psi with forces: a skip; a ReLU and no contact of edges; the first on another mesh."""
+    """Models of a random Psi with forces: a skip; a ReLU and no contact of edges; the first on a finer mesh."""
     skip, relu = random_force_psi(), random_force_psi(skip=False, without=("bending",), edge_contact=False)
-    mesh = specialise.on_mesh(skip.model(), skip.experiment.garment, np.zeros(10))
+    fine = storage.load_garment("tshirt_4000", skip.experiment.body)
+    mesh = specialise.on_mesh(skip.model(), fine, np.zeros(10))
     return {
         "skip": specialise.specialise(skip.model(betas=np.ones(10))),
         "relu": relu.model(material=Material(0.2, 2e4, 4e4, 10.0)),  # its bending is left out, or nothing else counts
@@ -191,6 +193,38 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
     for rows in errors.values():
         of_code, *of_rows = np.median(np.array(rows), axis=0)
         assert of_code < 0.01 and max(of_rows) < 1.5e-3  # m; the rows have the rounding of shapes and decoder
+
+
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh"])
+@pytest.mark.parametrize("highest, deepest", [(0.01, 0.02), (0.002, 0.05)])
+def test_c_shows_what_is_outside_of_the_planes_that_jax_feels(forced, name, highest, deepest, motion, monkeypatch):
+    """The planes are of the state before, so the rounding of shapes does not move them."""
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    monkeypatch.setattr(forces, "HIGHEST", highest)
+    monkeypatch.setattr(drape, "DEEPEST", deepest)
+    model = forced[name]
+    packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 0))
+    felt, offset = model.network.predictor.felt, model.config.physics.collision_offset
+    nearest, touched, beyond = slice(None) if felt is None else felt.nearest, 0, 0
+    for t in range(1, 5):
+        transforms = inference._transforms(model, *kinematics(model, at(motion, t)))
+        advance = at(motion, t).translation - at(motion, t - 1).translation
+        _, planes = drape.predict(model, state.latent, state.drape, transforms, at(motion, t), advance, None)
+        point, normal = planes.point_next[nearest], planes.normal_next[nearest]
+        state, vertices = psi_ffi.step(packed, state, at(motion, t))
+
+        def gap(shown, point=point, normal=normal):
+            return np.asarray(jnp.sum((shown - point) * normal, axis=-1))
+
+        depth = offset - gap(drape.shown(model, state.latent, transforms))  # without rounding, before it is pushed
+        found = gap(vertices - at(motion, t).translation[None])
+        on, far = (depth > 0.005) & (depth < deepest - 0.005), depth > deepest + 0.005
+        touched, beyond = touched + on.sum(), beyond + far.sum()
+        # a vertex between two faces may take the other one
+        assert np.mean(np.abs(found[on] - offset) < 2e-5) > 0.98
+        assert np.mean(np.abs(found - (offset - depth) - deepest)[far] < 0.004) > 0.98
+    assert touched > 100 and beyond > 20
 
 
 def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):

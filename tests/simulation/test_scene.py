@@ -22,7 +22,7 @@ from clothjax.training import laplacian_shapes, pipeline, stage1
 from clothjax.training.loss import weighing
 from clothjax.training.pool import dressed
 from clothjax.types import Garment, Motion
-from data_prep.garment import build
+from data_prep.templates import build
 from experiments import render
 from experiments.benchmark import scenes
 from experiments.benchmark.timing import cost, program
