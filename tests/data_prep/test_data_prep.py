@@ -32,7 +32,7 @@ from data_prep import (
     templates,
 )
 from data_prep.diffusion import diffuse
-from data_prep.dressing import WINDING
+from data_prep.dressing import ARM, WINDING
 from data_prep.remesh import remesh
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -476,7 +476,7 @@ def test_skirt_template(tmp_path, body, names):
     assert distance.min() > 0.002
     outward = igl.per_vertex_normals(skirt.vertices.astype(np.float64), faces)
     assert (outward[:, [0, 2]] * skirt.vertices[:, [0, 2]]).sum(axis=1).min() > 0
-    arms = [i for i, n in enumerate(names) if any(part in n.lower() for part in garment.ARM)]
+    arms = [i for i, n in enumerate(names) if any(part in n.lower() for part in ARM)]
     assert skirt.weights[:, arms].max() < 0.05
 
 
