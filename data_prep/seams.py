@@ -77,13 +77,10 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> No
     if not loops:
         return
     points, along = (np.concatenate(parts) for parts in zip(*loops, strict=True))
-    whole = np.concatenate([np.full(len(own), own[-1]) for _, own in loops])
     number = np.concatenate([np.full(len(own), k) for k, (_, own) in enumerate(loops)])
     pairs = cKDTree(points).query_pairs(BESIDE, output_type="ndarray")
     a, b = pairs.T
-    between = np.abs(along[a] - along[b])
-    between = np.minimum(between, whole[a] - between)
-    pairs = pairs[(number[a] != number[b]) | (between > NEIGHBOUR)]
+    pairs = pairs[(number[a] != number[b]) | (np.abs(along[a] - along[b]) > NEIGHBOUR)]
     apart = np.full(len(points), np.inf)
     distance = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     for side in pairs.T:

@@ -32,7 +32,8 @@ def test_bad_frames_are_those_of_a_jump_in_place(fps):
 
 def test_joint_positions_turn_about_their_parents():
     rotations = np.tile(np.eye(3), (1, 3, 1, 1))
+    rotations[0, 0] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     rotations[0, 1] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     motion = Motion(rotations, np.array([[1.0, 2.0, 3.0]]), 30.0)
-    expected = [[1, 2, 3], [1, 2.5, 3], [0.5, 2.5, 3]]
+    expected = [[1, 2, 3], [1, 2, 3.5], [0.5, 2, 3.5]]  # the second turns about the root's z, which points down
     np.testing.assert_allclose(plausibility.joint_positions(motion, BODY)[0], expected, atol=1e-12)
