@@ -11,10 +11,8 @@ Ours (`configs/thesis.yaml`) and NCS (`configs/ncs.yaml`) have the same garment,
 are numbered as in the thesis.
 """
 
-import base64
 import dataclasses
 import functools
-import html
 import io
 import json
 from pathlib import Path
@@ -40,6 +38,7 @@ from clothjax.types import Pose
 from data_prep import garment as garment_module
 from data_prep.garment import Arguments
 from experiments.benchmark import pareto
+from experiments.html_page import Section, image, page, picture, sheet, table
 
 matplotlib.use("Agg")
 
@@ -62,10 +61,6 @@ MEASURES = {
 PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
 LOOSE = "dress"  # of figure 9, where it is there
 FRAME = 40  # of the bodies of figure 6
-STYLE = (
-    "body{font:16px sans-serif;max-width:70em;margin:2em auto} img{max-width:100%} "
-    "td,th{padding:.2em .8em;text-align:right}"
-)
 BROKEN, AFTER = 20, 60  # frames before and after a code is broken
 FARNESS = 10.0  # deviations, of the broken code
 
@@ -89,7 +84,9 @@ def main(argv: list[str]) -> None:
         report[make.__name__] = figures
         sections.append(section)
     (arguments.out / "report.json").write_text(json.dumps(report, indent=1) + "\n")
-    (arguments.out / "report.html").write_text(page(sections))
+    (arguments.out / "report.html").write_text(
+        page("clothjax: the thesis again", "The thesis's experiments, with clothjax", sections)
+    )
     print(f"written to {arguments.out / 'report.html'}")
 
 
@@ -152,7 +149,6 @@ def measures(run: Path) -> dict[str, dict[str, float]]:
 
 # --- the figures: each gives its numbers and its section ----------------------------------------------------------
 
-Section = tuple[str, str]  # title, HTML
 Runs = dict[str, dict[str, Path]]  # by garment and network
 
 
@@ -174,7 +170,7 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
             solver = saved.solver
         experiment = assembly.assemble(config)
         rows, columns = pictures.at_moments(experiment, motion, tracks | {"solver": solver}, MOMENTS)
-        parts.append(f"<h3>{garment}</h3>" + table(figures[garment]) + sheet(rows, columns))
+        parts.append(f"<h3>{garment}</h3>" + table(figures[garment], MEASURES) + sheet(rows, columns))
     text = (
         "<p>Every network in its own rollout on a motion and a body that none has seen. A gap of 0 is the solver, "
         "1 plain skinning (energy) or cloth that keeps its shape (hold).</p>"
@@ -209,7 +205,7 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
         tracks |= {stage: saved.stages[stage], "solver": saved.solver}
     rows, columns = pictures.at_moments(assembly.assemble(config), motion, tracks, MOMENTS)
     text = "<p>Predictor, decoder and blend shapes trained on the losses alone, for the same time.</p>"
-    return figures, (title, text + table(figures) + sheet(rows, columns))
+    return figures, (title, text + table(figures, MEASURES) + sheet(rows, columns))
 
 
 def failure(runs: Runs) -> tuple[dict, Section]:
@@ -319,49 +315,6 @@ def inputs(runs: Runs) -> tuple[dict, Section]:
         figures["ncs"] = {"code": code, "pose": pose, "wearer": wearer, "all": code + pose + wearer}
     columns = {"code": "carried from the last frame", "pose": "pose", "wearer": "body and cloth", "all": "all"}
     return figures, ("Inputs", "<p>Numbers read in a frame.</p>" + table(figures, columns))
-
-
-# --- the page -----------------------------------------------------------------------------------------------------
-
-
-def page(sections: list[Section]) -> str:
-    """Return one HTML file."""
-    body = "".join(f"<h2>{html.escape(title)}</h2>{content}" for title, content in sections)
-    return (
-        f"<!doctype html><meta charset=utf-8><title>clothjax: the thesis again</title><style>{STYLE}</style>"
-        f"<h1>The thesis's experiments, with clothjax</h1>{body}\n"
-    )
-
-
-def table(rows: dict[str, dict], columns: dict[str, str] = MEASURES) -> str:
-    """Return a table of numbers."""
-    head = "".join(f"<th>{html.escape(label)}</th>" for label in columns.values())
-    lines = [
-        f"<tr><th>{html.escape(name)}</th>"
-        + "".join(f"<td>{values[key]:.3g}</td>" if key in values else "<td></td>" for key in columns)
-        + "</tr>"
-        for name, values in rows.items()
-    ]
-    return f"<table><tr><th></th>{head}</tr>{''.join(lines)}</table>"
-
-
-def sheet(rows: dict[str, list[np.ndarray]], columns: list[str]) -> str:
-    """Draw pictures in rows and columns."""
-    buffer = io.BytesIO()
-    ray_cast.comparison(buffer, rows, columns)
-    return picture(buffer.getvalue())
-
-
-def image(figure: plt.Figure) -> str:
-    """Return a plot as an image, and close it."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    plt.close(figure)
-    return picture(buffer.getvalue())
-
-
-def picture(png: bytes) -> str:
-    return f'<p><img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt=""></p>'
 
 
 if __name__ == "__main__":
