@@ -117,7 +117,7 @@ def _again(
 
     @partial(jax.jit, static_argnums=2)
     def starting(state: stage1.TrainingState, clips: Clips, frames: int):
-        return stage1.next_batch(state, experiment.scene, clips, frames, config)
+        return pool.next_batch(state.pool, state.step, state.key, experiment.scene, clips, frames, config)
 
     update = stage1.make_curriculum(experiment.scene, clips, config, 1, None, animator)
     return update, lambda state: starting(state, clips, stage1.rollout_length(int(state.step), config)), state

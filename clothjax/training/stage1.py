@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from clothjax.body import motion_clips
 from clothjax.body.motion_clips import Clips
-from clothjax.config import Config, Stage1Config
+from clothjax.config import Config
 from clothjax.material import configured_material
 from clothjax.networks import animators, baselines, decoder, graph_features, mlp, phi, psi
 from clothjax.networks.animators import MakeAnimator
@@ -26,11 +26,10 @@ from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.scene import Scene
 from clothjax.training import devices, laplacian_shapes, loop
 from clothjax.training.loss import weighing
-from clothjax.training.pool import Simulation, begin, dressed
-from clothjax.types import Array, ClothState
+from clothjax.training.pool import Simulation, advance, begin, dressed, next_batch, reset_mask
+from clothjax.types import Array
 
 NORMALIZER_STEPS = 2000  # over which the feature statistics are collected; then they are frozen
-MAX_DISTANCE = 5.0  # m from the root, where cloth counts as lost
 
 
 class TrainingState(NamedTuple):
@@ -256,7 +255,9 @@ def train_step(problem: Problem, clips: Clips, state: TrainingState) -> tuple[Tr
     The batch is rolled out, the gradient changes the parameters, and the simulations go back into the pool.
     """
     stage = problem.config.stage1
-    chosen, simulations = next_batch(state, problem.scene, clips, problem.frames, problem.config)
+    chosen, simulations = next_batch(
+        state.pool, state.step, state.key, problem.scene, clips, problem.frames, problem.config
+    )
     rollouts = devices.shard(partial(batch_gradient, problem), problem.device_mesh)
     (losses, (cloth, terms, seen)), gradients = rollouts(simulations, state.params, state.statistics, state.step, clips)
     new, metrics = loop.apply_gradient(
@@ -273,28 +274,6 @@ def train_step(problem: Problem, clips: Clips, state: TrainingState) -> tuple[Tr
     new = new._replace(pool=jax.tree.map(lambda pool, value: pool.at[chosen].set(value), state.pool, moved))
     metrics["lost"] = jnp.sum(lost)
     return new, metrics | {name: jnp.mean(values) for name, values in terms.items()}
-
-
-def next_batch(
-    state: TrainingState, scene: Scene, clips: Clips, frames: int, config: Config
-) -> tuple[Array, Simulation]:
-    """Take the next B simulations from the pool: return their places [B] in it, and the simulations.
-
-    A simulation starts again if its clip has fewer than `frames` frames left, or at random
-    (`restart_probability`).
-    """
-    stage = config.stage1
-    begin_key, restart_key = jax.random.split(jax.random.fold_in(state.key, state.step))
-    chosen = (state.step * stage.batch + jnp.arange(stage.batch)) % stage.pool
-    simulations = jax.tree.map(lambda x: x[chosen], state.pool)
-    restart = jax.random.uniform(restart_key, (stage.batch,)) < stage.restart_probability
-    restart |= clips.remaining[simulations.frame] < frames
-
-    def restarted(simulations):
-        fresh = jax.vmap(lambda k: begin(k, scene, clips, config))(jax.random.split(begin_key, stage.batch))
-        return jax.tree.map(lambda a, b: _where(restart, a, b), fresh, simulations)
-
-    return chosen, jax.lax.cond(jnp.any(restart), restarted, lambda same: same, simulations)
 
 
 def batch_gradient(
@@ -316,32 +295,6 @@ def batch_gradient(
 
     outputs, gradient = losses_and_gradient(loss, params, simulations)
     return outputs, jax.tree.map(lambda x: x[None], gradient)
-
-
-def reset_mask(cloth: ClothState, losses: Array, stage: Stage1Config) -> Array:
-    """Return which simulations are lost: a mask [B].
-
-    Lost is one with a vertex `MAX_DISTANCE` or more from the root, with a loss of `stage.lost` or more, or with either
-    not finite.
-
-    Args:
-        cloth: positions [B, V, 3] m after the rollout.
-        losses: [B].
-    """
-    lost = ~(jnp.max(jnp.abs(cloth.position), axis=(1, 2)) < MAX_DISTANCE)
-    return lost | ~(losses < (jnp.inf if stage.lost is None else stage.lost))
-
-
-def advance(simulations: Simulation, cloth: ClothState, lost: Array, clips: Clips, frames: int) -> Simulation:
-    """Return the simulations [B] after a rollout of `frames` frames.
-
-    Lost ones keep their cloth and go to the last frame of the clips, where no frame is left: `next_batch` restarts
-    them.
-    """
-    advanced = jnp.where(simulations.fresh, frames - 1, frames)
-    frame = jnp.where(lost, clips.remaining.shape[0] - 1, simulations.frame + advanced)
-    cloth = jax.tree.map(lambda new, old: _where(lost, old, new), cloth, simulations.cloth)
-    return Simulation(cloth, simulations.betas, simulations.material, frame, jnp.zeros_like(simulations.fresh))
 
 
 def observe(state: TrainingState, seen: Features, skipped: Array) -> dict:
@@ -386,8 +339,3 @@ def losses_and_gradient(loss: Callable, params: dict, batch):
 
     total, outputs = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), batch)
     return outputs, jax.tree.map(lambda x: x / count, total)
-
-
-def _where(condition: Array, new: Array, old: Array) -> Array:
-    shaped = condition.reshape(condition.shape + (1,) * (new.ndim - condition.ndim))
-    return jnp.where(shaped, new, old)

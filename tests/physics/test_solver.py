@@ -9,7 +9,7 @@ import scipy.sparse
 from samples import DT, sheet, time_step
 
 from clothjax.config import PhysicsConfig
-from clothjax.physics import energies, incremental_potential, solver
+from clothjax.physics import energies, hessians, incremental_potential, solver
 
 CONFIG = PhysicsConfig()
 
@@ -130,9 +130,9 @@ def test_the_result_is_a_minimum():
 
 
 def hessian_matrices(x, step, mesh):
-    pattern = solver.structure(step, mesh)
+    pattern = hessians.structure(step, mesh)
     with jax.enable_x64(True):
-        blocks = solver.hessians(x, jax.tree.map(jnp.asarray, step), mesh, pattern, CONFIG)
+        blocks = hessians.blocks(x, jax.tree.map(jnp.asarray, step), mesh, pattern, CONFIG)
     return [scipy.sparse.bsr_array((np.asarray(b), pattern.indices, pattern.indptr)).toarray() for b in blocks]
 
 
@@ -211,7 +211,7 @@ def test_float32_in_float64_out_and_no_change_to_the_process():
 
 def test_structure_holds_every_pair_of_neighbours_once():
     step, mesh = crumpled(edges=True, self_contact=True)
-    pattern = solver.structure(step, mesh)
+    pattern = hessians.structure(step, mesh)
     expected = np.eye(36, dtype=bool)
     for corners in (*mesh.faces, *mesh.hinges):
         expected[np.ix_(corners, corners)] = True

@@ -14,6 +14,7 @@ from clothjax.networks import animators
 from clothjax.simulation import assembly, characters, rollout
 from clothjax.training import loop, stage1
 from clothjax.training.loss import weighing
+from clothjax.training.pool import next_batch
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +85,8 @@ def test_a_simulation_whose_energy_tells_that_it_is_lost_is_begun_anew(toy, upda
     after, metrics = update(state._replace(pool=torn))
     assert metrics["lost"][0] and float(metrics["loss"][0]) > highest and np.isfinite(metrics["loss"][0])
     again = after._replace(step=jnp.int32(0))  # its next turn
-    _, begun = stage1.next_batch(again, experiment.scene, jax.tree.map(jnp.asarray, reel), 1, experiment.config)
+    moving = jax.tree.map(jnp.asarray, reel)
+    _, begun = next_batch(again.pool, again.step, again.key, experiment.scene, moving, 1, experiment.config)
     assert np.abs(begun.betas[0] - betas).max() > 0
 
 
