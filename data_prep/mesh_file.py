@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from data_prep import gltf
+from data_prep import gltf_file
 
 BETWEEN = "\x1f"  # names of an object, its group and its material
 
@@ -31,7 +31,7 @@ def read(path: str | Path) -> Mesh:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        parts = _of_gltf(path) if path.suffix.lower() in (".glb", ".gltf") else _of_trimesh(path)
+        parts = _of_gltf(path) if path.suffix.lower() in gltf_file.SUFFIXES else _of_trimesh(path)
     except Exception as error:  # whatever a reader of a damaged file of some format raises
         hint = "export it as .obj or .glb"
         if path.suffix.lower() == ".ply":
@@ -108,7 +108,7 @@ def _absolute(index: str, count: int) -> str:
 
 
 def _of_gltf(path: Path) -> list[_Part]:
-    parts = [part for part in gltf.parts(path) if len(part.faces)]
+    parts = [part for part in gltf_file.parts(path) if len(part.faces)]
     colours = [None if part.colours is None else 255.0 * part.colours for part in parts]
     return [
         _Part(part.names, part.vertices, part.faces, _is_red(own, len(part.vertices)))

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from data_prep import gltf, mesh_file
-from data_prep.gltf import DTYPES
+from data_prep import gltf_file, mesh_file
+from data_prep.gltf_file import DTYPES
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -155,7 +155,7 @@ def test_damaged_files_are_refused(tmp_path):
             mesh_file.read(tmp_path / "b.glb")
     file.json["nodes"][1]["children"] = [0]  # a circle
     with pytest.raises(ValueError, match="two parents"):
-        gltf.Document(file.save(tmp_path / "a.glb")).places()
+        gltf_file.Document(file.save(tmp_path / "a.glb")).places()
 
 
 OBJ = """o shirt

@@ -14,14 +14,8 @@ from scipy.spatial.transform import Rotation
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-READ = (
-    "KHR_mesh_quantization",
-    "KHR_materials_unlit",
-    "KHR_texture_transform",
-    "KHR_lights_punctual",
-    "VRM",
-    "VRMC_vrm",
-)
+SUFFIXES = (".glb", ".gltf", ".vrm")
+READ = ("KHR_mesh_quantization", "KHR_texture", "KHR_lights", "KHR_materials", "EXT_texture", "VRM")  # beginnings
 GLB = b"glTF"
 TRIANGLES = 4  # the mode of a primitive; strips and fans follow
 MOST = 10_000_000  # entries of an accessor
@@ -58,7 +52,7 @@ class Document:
             data = next((chunk for kind, chunk in chunks if kind == b"JSON"), b"")
             self.binary = next((chunk for kind, chunk in chunks if kind == b"BIN\0"), b"")
         self.json: dict[str, Any] = json.loads(data)
-        needed = [name for name in self.json.get("extensionsRequired", ()) if name not in READ]
+        needed = [name for name in self.json.get("extensionsRequired", ()) if not name.startswith(READ)]
         if needed:
             raise ValueError(f"compressed or special ({', '.join(needed)}): export it without")
         self._buffers: dict[int, bytes] = {}
