@@ -11,7 +11,7 @@ from clothjax.runtime.models import CAUSES, Drape, Model, PosePredictor, State
 from clothjax.types import Array, Pose
 
 HISTORY = ("latent", "rotations", "positions", "translations")  # of a state, and ...
-DRAPE = ("change", "garment", "position", "velocity")  # ... with forces
+DRAPE = ("change", "garment", "position", "velocity", "still")  # ... with forces
 
 
 def _with_forces(model: Model) -> bool:
@@ -44,8 +44,8 @@ def function(model: Model) -> Callable:
     """
 
     def frame(*given: Array) -> tuple:
-        drape = Drape(*given[4:8]) if _with_forces(model) else None
-        rotations, translation, *external = given[4 if drape is None else 8 :]
+        drape = Drape(*given[4:9]) if _with_forces(model) else None
+        rotations, translation, *external = given[4 if drape is None else 9 :]
         latent, before, places, translations = given[:4]
         state = State(latent, before, places, translations, jnp.zeros(len(CAUSES), bool), drape)
         following, vertices = inference.step(model, state, Pose(rotations, translation), True, *external)
@@ -60,7 +60,7 @@ def shapes(model: Model) -> dict[str, tuple[int, ...]]:
     sizes: list[tuple[int, ...]] = [code, (2, joints, 3, 3), (2, joints, 3), (2, 3)]
     if (cloth := model.wearer.cloth) is not None:
         vertices = len(cloth.mass)
-        sizes += [code, (3, vertices), (vertices, 3), (vertices, 3)]
+        sizes += [code, (3, vertices), (vertices, 3), (vertices, 3), ()]
     sizes += [(joints, 3, 3), (3,), (3,)]
     return dict(zip(arguments(model), sizes, strict=False))  # `external` is of forces alone
 

@@ -15,7 +15,7 @@ from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
 
-DRAPE = ("change", "garment", "position", "velocity")  # of the state, beside `latent` and `history`
+DRAPE = ("change", "garment", "position", "velocity", "still")  # of the state, beside `latent` and `history`
 AXES = ([1, 2, 0], [2, 0, 1])
 
 
@@ -45,7 +45,8 @@ def parts(model: Model) -> Parts:
 def shapes(model: Model) -> dict[str, tuple[int, ...]]:
     """Return the shapes of `DRAPE` by name, without the leading axis."""
     vertices = len(parts(model).cloth.mass)
-    return dict(zip(DRAPE, ((len(model.network.first),), (3, vertices), (vertices, 3), (vertices, 3)), strict=True))
+    sizes = ((len(model.network.first),), (3, vertices), (vertices, 3), (vertices, 3), ())
+    return dict(zip(DRAPE, sizes, strict=True))
 
 
 def blended(g: Graph, transforms: str, weights: np.ndarray) -> str:
@@ -61,13 +62,16 @@ def moved(g: Graph, rows: str, points: str) -> str:
     return g("Add", turned, g("Squeeze", g.slice(rows, 2, 3, 4), np.array([2], np.int64)))
 
 
-def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) -> tuple[str, tuple[str, str]]:
+def next_code(
+    g: Graph, model: Model, rows: str, transforms: str, advance: str, turned: str
+) -> tuple[str, tuple[str, str]]:
     """Return the next code [N, L], not yet clipped, with points and normals [N, 3, V] of what the garment touches.
 
     Args:
         rows: transforms [N, 3, 4, V] of the garment that feels, at the next frame.
         transforms: [N, J', 12] of the joints.
         advance: [N, 3, 1] m, the root's step.
+        turned: [N, 1, 9 J], the change of the joints' rotations.
     """
     it = parts(model)
     held = g("Add", moved(g, rows, "garment"), advance)
@@ -79,12 +83,12 @@ def next_code(g: Graph, model: Model, rows: str, transforms: str, advance: str) 
         _contact(g, model, held, *planes),
     ]
     on_vertices = g("Concat", *(g("Unsqueeze", kind, np.array([1], np.int64)) for kind in kinds), axis=1)
-    turned = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
-    carried_back = g("Mul", turned, g("Unsqueeze", on_vertices, np.array([3], np.int64)))
+    rotation = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
+    carried_back = g("Mul", rotation, g("Unsqueeze", on_vertices, np.array([3], np.int64)))
     carried_back = g("ReduceSum", carried_back, np.array([2], np.int64), keepdims=0)  # [N, kinds, 3, V]
     flat = g.reshape(carried_back, len(KINDS), int(np.prod(it.template.shape)))
     pulls = _pulled_back(g, model, g("MatMul", flat, np.asarray(it.felt.shapes).T))
-    return _predicted(g, model, it, pulls), planes
+    return _predicted(g, model, it, pulls, _awake(g, turned, advance)), planes
 
 
 def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance: str) -> str:
@@ -127,11 +131,27 @@ def pushed(g: Graph) -> str:
     return g.all(g("Less", g("Abs", "external"), np.float32(np.finfo(np.float32).max)), axis=1)
 
 
+def _external(g: Graph) -> str:
+    """Return the external acceleration [N, 3] m/s^2, zero where it is not finite."""
+    return g("Where", pushed(g), "external", np.zeros((1, 3)))
+
+
+def _awake(g: Graph, turned: str, advance: str) -> str:
+    """Name the next `still` as `drape.stood` does; return the share [N, 1] that is left of a change of the code."""
+    moved = g("ReduceMax", g("Abs", turned), axes=[1, 2], keepdims=0)
+    moved = g("Max", moved, g("ReduceMax", g("Abs", advance), axes=[1, 2], keepdims=0))
+    quiet = g("Equal", g("ReduceMax", g("Abs", _external(g)), axes=[1], keepdims=0), np.float32(0.0))
+    quiet = g("And", g("Less", moved, np.float32(drape.STILL)), quiet)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    still = g("Where", quiet, g("Add", "still", one), zero, name="next_still")
+    share = g("Pow", np.float32(drape.SLOWING), g("Relu", g("Sub", still, np.float32(drape.AWAKE))))
+    return g("Unsqueeze", share, np.array([1], np.int64))
+
+
 def _momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
     timestep = 1.0 / model.config.fps
     weight = 0.0 if "gravity" in model.config.physics.without else GRAVITY
-    external = g("Where", pushed(g), "external", np.zeros((1, 3)))
-    further = g("Mul", g.reshape(external, 1, 3), np.float32(timestep**2))
+    further = g("Mul", g.reshape(_external(g), 1, 3), np.float32(timestep**2))
     flown = g("Add", g("Add", "position", "velocity"), further)
     apart = g("Sub", g("Transpose", flown, perm=[0, 2, 1]), held)
     down = np.array([[0.0], [-weight], [0.0]])
@@ -288,8 +308,12 @@ def _masked(g: Graph, force: str, before: str) -> str:
     return g("Mul", force, g("Unsqueeze", open_, np.array([1], np.int64)))
 
 
-def _predicted(g: Graph, model: Model, it: Parts, pulls: str) -> str:
-    """Return the next code [N, L] from the forces [N, kinds, L] on whitened codes, as `psi.next_code`."""
+def _predicted(g: Graph, model: Model, it: Parts, pulls: str, share: str) -> str:
+    """Return the next code [N, L] from the forces [N, kinds, L] on whitened codes, as `psi.next_code`.
+
+    Args:
+        share: [N, 1], that is left of its change.
+    """
     scales, params, size = it.predictor.scales, it.predictor.params, len(model.network.first)
     inputs = (2 + len(KINDS)) * size
     change = g("MatMul", "change", np.asarray(scales.whitening.to))
@@ -308,7 +332,8 @@ def _predicted(g: Graph, model: Model, it: Parts, pulls: str) -> str:
         layer = params["mlp"][f"dense_{number}"]
         x = g.layer(g("Relu", x), Layer(layer["kernel"], layer["bias"]))
     moved_by = g("Add", g.layer(seen, reading(params["linear"])), x)
-    return g("Add", "latent", g("MatMul", moved_by, np.asarray(scales.output) * np.asarray(scales.whitening.back)))
+    change = g("MatMul", moved_by, np.asarray(scales.output) * np.asarray(scales.whitening.back))
+    return g("Add", "latent", g("Mul", share, change))
 
 
 def _dot(g: Graph, a: str, b: str) -> str:

@@ -20,6 +20,9 @@
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
+#define STILL 2.5e-5f     /* of rotation matrices, and in m: a pose that changes by less stands still */
+#define AWAKE 60          /* frames that the cloth moves freely for on a body that stands still; then ... */
+#define SLOWING 0.95f     /* ... in each frame the change of the code shrinks by this */
 
 typedef struct { /* y = bias + scale * (weights (gain * x)); without inputs the bias alone */
     int32_t inputs, outputs, stride;
@@ -77,7 +80,8 @@ struct psi_state {
     int16_t *fixed; /* inputs of layers in fixed point */
     /* with forces, rows [vertices, to a multiple of LANES] */
     float external[3];
-    int pushed; /* whether the external acceleration was finite */
+    int pushed;  /* whether the external acceleration was finite */
+    float still; /* frames for which the body has stood still and nothing has pushed */
     float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
     float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it was raised */
@@ -906,6 +910,17 @@ static void soften(float *restrict x, const float *restrict middle, const float 
     }
 }
 
+/* Counts a frame for which the body stands still, or begins to count again; the share that is left of a change. */
+static float awake(const psi_model *m, psi_state *s) {
+    const size_t size = 9 * (size_t)m->joints;
+    int still = 1;
+    for (size_t i = 0; i < size; i++) still &= fabsf(s->rotations[i] - s->rotations[size + i]) < STILL;
+    for (int c = 0; c < 3; c++)
+        still &= fabsf(s->translation[c] - s->translation[3 + c]) < STILL && s->external[c] == 0.0f;
+    s->still = still ? s->still + 1.0f : 0.0f;
+    return s->still > AWAKE ? powf(SLOWING, s->still - AWAKE) : 1.0f;
+}
+
 /* The next code from the forces on the held garment at the new pose, in s->next. */
 static void predict_from_forces(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
@@ -941,7 +956,8 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     }
     for (int32_t i = 0; i < code; i++) s->next[i] += y[i];
     dense_exact(&f->move, s->next, z, y, s);
-    for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + z[i] + sum;
+    const float share = awake(m, s);
+    for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;
 }
 
 /* How the garment hangs after a step; the code before it is in s->next. */
@@ -1112,7 +1128,7 @@ int psi_push(const psi_model *m, psi_state *s, const float *external) {
 }
 
 int psi_carried(const psi_model *m) {
-    return m->code + 24 * m->joints + 6 + (m->forced ? m->code + 9 * m->f.vertices : 0);
+    return m->code + 24 * m->joints + 6 + (m->forced ? m->code + 9 * m->f.vertices + 1 : 0);
 }
 
 /* Rows [3][vertices] as they are carried: as they are, or one vertex after the other. */
@@ -1138,7 +1154,7 @@ void psi_keep(const psi_model *m, const psi_state *s, float *carried) {
     if (!m->forced) return;
     memcpy(carried += 6, s->change, m->code * sizeof(float));
     carried = put_rows(&m->f, s->garment, 1, carried + m->code);
-    put_rows(&m->f, s->velocity, 0, put_rows(&m->f, s->position, 0, carried));
+    *put_rows(&m->f, s->velocity, 0, put_rows(&m->f, s->position, 0, carried)) = s->still;
 }
 
 void psi_put_back(const psi_model *m, psi_state *s, const float *carried) {
@@ -1149,5 +1165,5 @@ void psi_put_back(const psi_model *m, psi_state *s, const float *carried) {
     if (!m->forced) return;
     memcpy(s->change, carried += 6, m->code * sizeof(float));
     carried = take_rows(&m->f, s->garment, 1, carried + m->code);
-    take_rows(&m->f, s->velocity, 0, take_rows(&m->f, s->position, 0, carried));
+    s->still = *take_rows(&m->f, s->velocity, 0, take_rows(&m->f, s->position, 0, carried));
 }

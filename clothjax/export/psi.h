@@ -52,7 +52,8 @@ int psi_outside(const psi_state *state);
 
 /* What of a state goes on from frame to frame, psi_carried() floats, to be kept and put back: the code, then of the last
  * two poses, newest first, the rotations, the joints' positions [2][joints][3] and the translations. With forces, then
- * the change of the code, the canonical garment [3][vertices], and its positions and velocities [vertices][3]. */
+ * the change of the code, the canonical garment [3][vertices], its positions and velocities [vertices][3], and the frames
+ * for which the body has stood still. */
 int psi_carried(const psi_model *model);
 void psi_keep(const psi_model *model, const psi_state *state, float *carried);
 void psi_put_back(const psi_model *model, psi_state *state, const float *carried);

@@ -24,8 +24,8 @@ STATE_WITH_FORCES = {
     "state": "feed what is called next_NAME back as NAME",
     "external": "an acceleration of the cloth beside gravity, m/s^2, such as wind; zeros for none",
     "first_state": f"{STATE['first_state']}; all else of the state is zeros in that run. Then garment and position are "
-    "its next_garment and next_position; change, velocity and external are zeros. Run `settling` times with that pose, "
-    "feeding the state back: the garment settles",
+    "its next_garment and next_position; change, velocity, still and external are zeros. Run `settling` times with "
+    "that pose, feeding the state back: the garment settles",
     "settling": SETTLING,
 }
 

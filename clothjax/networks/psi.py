@@ -152,8 +152,13 @@ def next_code(
     forces: Array,
     constants: Array,
     config: Stage2Config,
+    share: Array | float = 1.0,
 ) -> Array:
-    """Return the next code [L] of a Psi with forces, not yet clipped to its range; arguments as of `force_inputs`."""
+    """Return the next code [L] of a Psi with forces, not yet clipped to its range; arguments as of `force_inputs`.
+
+    Args:
+        share: of the code's change, which is taken.
+    """
     inputs = scaled_inputs(scales, force_inputs(code, change, forces, constants, scales.whitening))
     moved = scales.output * mlp.apply(ForcePsi(config, len(code)), params, inputs)
-    return code + jnp.matmul(moved, scales.whitening.back, precision="highest")
+    return code + share * jnp.matmul(moved, scales.whitening.back, precision="highest")

@@ -15,6 +15,9 @@ from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network
 from clothjax.types import Array, Contact, Pose
 
 HIGHEST = jax.lax.Precision.HIGHEST
+STILL = 2.5e-5  # of the rotation matrices, and in m: a pose that changes by less stands still
+AWAKE = 60  # frames that the cloth moves freely for on a body that stands still; then ...
+SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
 DEEPEST = 0.02  # m, by which a vertex that would be shown in the body is pushed out of it at most
 
 
@@ -59,7 +62,22 @@ def begin(model: Model, latent: Array, transforms: Array) -> Drape:
     felt, template = felt_garment(model)
     garment = _canonical(model, latent, felt, template)
     position = _skin(_rows(felt.weights, transforms), garment).T
-    return Drape(jnp.zeros_like(latent), garment, position, jnp.zeros_like(position))
+    return Drape(jnp.zeros_like(latent), garment, position, jnp.zeros_like(position), jnp.float32(0.0))
+
+
+def stood(drape: Drape, rotations: Array, advance: Array, external: Array | None) -> Drape:
+    """Count a frame for which the body stands still, or begin to count again.
+
+    Args:
+        drape: of the current frame.
+        rotations: [2, J, 3, 3] of the next frame and the current one.
+        advance: [3] m, the root's step.
+        external: [3] m/s^2 or None, as of `inference.step`.
+    """
+    still = (jnp.max(jnp.abs(rotations[0] - rotations[1])) < STILL) & jnp.all(jnp.abs(advance) < STILL)
+    if external is not None:
+        still &= jnp.all(external == 0.0)
+    return drape._replace(still=jnp.where(still, drape.still + 1.0, 0.0))
 
 
 def predict(
@@ -68,7 +86,7 @@ def predict(
     """Predict the next code from the forces on the held garment at the next frame.
 
     Args:
-        latent, drape: of the current frame.
+        latent, drape: of the current frame, the latter as `stood` returns it.
         transforms: [J', 3, 4] of the joints at the next frame.
         pose: of the next frame.
         advance: [3] m, the root's step to it.
@@ -101,7 +119,16 @@ def predict(
     on_weights = jnp.matmul(carried_back.reshape(len(forces.KINDS), -1), felt.shapes.T, precision=HIGHEST)
     _, pullback = jax.vjp(lambda code: blend_weights(model.network, code, config), latent)
     pulls = jax.vmap(lambda force: pullback(force)[0])(on_weights)
-    code = psi.next_code(parts.params, parts.scales, latent, drape.change, pulls, cloth.constants, config.stage2)
+    code = psi.next_code(
+        parts.params,
+        parts.scales,
+        latent,
+        drape.change,
+        pulls,
+        cloth.constants,
+        config.stage2,
+        SLOWING ** jnp.maximum(drape.still - AWAKE, 0.0),
+    )
     return code, planes._replace(point_next=planes.point_next - advance[None])
 
 
@@ -116,7 +143,8 @@ def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms:
     felt, template = felt_garment(model)
     garment = _canonical(model, latent, felt, template)
     position = _skin(_rows(felt.weights, transforms), garment).T
-    return Drape(latent - before, garment, position, position + advance[None] - drape.position)
+    velocity = position + advance[None] - drape.position
+    return Drape(latent - before, garment, position, velocity, drape.still)
 
 
 def _forces(model: Model) -> ForcePredictor:

@@ -106,6 +106,7 @@ def _advanced(
     else:
         assert hung is not None
         ordinary = True
+        hung = drape.stood(hung, rotations[:2], advance[0], external)
         latent, planes = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
     latent, inside = normalisation.bounded(latent, *network.code_bounds)
     if hung is not None:

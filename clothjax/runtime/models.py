@@ -169,6 +169,7 @@ class Drape(NamedTuple):
     garment: Array  # [3, V] m, in the canonical pose
     position: Array  # [V, 3] m
     velocity: Array  # [V, 3] m per frame
+    still: Array  # frames for which the body has stood still and nothing else has pushed, as a float
 
 
 class State(NamedTuple):

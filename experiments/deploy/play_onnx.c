@@ -16,14 +16,14 @@
 
 #include "onnxruntime_c_api.h"
 
-enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS, CHANGE = INPUTS, GARMENT, POSITION, MORE = 5 };
+enum { LATENT, HISTORY, ROTATIONS, TRANSLATION, INPUTS, CHANGE = INPUTS, GARMENT, POSITION, MORE = 6 };
 enum { NEXT_LATENT, NEXT_HISTORY, OK, OUTPUTS = 4 };
-/* a garment with forces has four more arrays in its state, and is pushed by an external acceleration */
+/* a garment with forces has five more arrays in its state, and is pushed by an external acceleration */
 static const char *const inputs[INPUTS + MORE] = {"latent", "history", "rotations", "translation", "change", "garment",
-                                                  "position", "velocity", "external"};
+                                                  "position", "velocity", "still", "external"};
 static const char *const plain[OUTPUTS] = {"next_latent", "next_history", "ok", "vertices"};
 static const char *const forced[OUTPUTS + MORE - 1] = {"next_latent", "next_history", "ok", "next_change",
-                                                       "next_garment", "next_position", "next_velocity", "vertices"};
+                                                       "next_garment", "next_position", "next_velocity", "next_still", "vertices"};
 
 static const OrtApi *ort;
 

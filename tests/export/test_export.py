@@ -329,6 +329,28 @@ def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):
     assert np.abs(found[0] - found[1]).max() > 1e-4
 
 
+def test_onnx_of_forces_comes_to_rest_as_the_model(forced, motion, tmp_path):
+    """Two characters: one has stood for 74 frames, the other for 10."""
+    model, pose = forced["skip"], Pose(jnp.asarray(motion.rotations[0]), jnp.asarray(motion.translation[0]))
+    run, names = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=2)), (*onnx.STATE, *onnx_forces.DRAPE)
+    given = dict(zip(names, onnx.first_state(model, pose, 2)))
+    given["still"] = np.array([74, 10], np.float32)
+    wanted = [f"next_{name}" for name in ("change", "still")]
+    for moved, pushed in ((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3)):
+        there = Pose(pose.rotations, pose.translation + jnp.array([0.0, moved, 0.0]))
+        external = np.array([[0.0, pushed, 0.0]] * 2, np.float32)
+        poses = {"rotations": np.stack([there.rotations] * 2), "translation": np.stack([there.translation] * 2)}
+        change, still = run.run(wanted, given | poses | {"external": external})
+        for i, stood in enumerate((74.0, 10.0)):
+            state = inference.initial_state(model, pose)
+            state = state._replace(drape=state.drape._replace(still=jnp.float32(stood)))
+            expected = inference.step(model, state, there, external=jnp.asarray(external[i]))[0].drape
+            np.testing.assert_allclose(change[i], expected.change, atol=1e-4)
+            assert still[i] == expected.still
+        asleep = np.abs(change[0]).max() / np.abs(change[1]).max()
+        assert asleep == pytest.approx(1.0 if moved or pushed else 0.95**15, rel=1e-3)
+
+
 def test_onnx_of_forces_forgets_what_is_not_finite(motion, tmp_path):
     model = random_force_psi(limit=1e3).model()
     run = session(onnx.to_onnx(model, tmp_path / "g.onnx"))
@@ -382,7 +404,7 @@ def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
         again = safetensors.from_safetensors(safetensors.to_safetensors(model, tmp_path / "g.safetensors"))
         assert_same(again, model)
         about = json.loads((tmp_path / "g.json").read_text())
-        assert about["arguments"]["external"] == [3] and len(about["results"]) == 10
+        assert about["arguments"]["external"] == [3] and len(about["results"]) == 11
 
 
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):

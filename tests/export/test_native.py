@@ -185,7 +185,7 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
             found, vertices = psi_ffi.step(packed, state, at(motion, t), external=pushed)
             expected, shown = inference.step(model, state, at(motion, t), external=pushed)
             change = jnp.linalg.norm(found.drape.change - expected.drape.change)
-            pairs = [(vertices, shown), *zip(found.drape[2:], expected.drape[2:])]
+            pairs = [(vertices, shown), *zip(found.drape[2:4], expected.drape[2:4])]
             pairs.append((found.drape.garment.T, expected.drape.garment.T))
             apart = [jnp.linalg.norm(x - y, axis=1).mean() for x, y in pairs]
             rows.append([change / jnp.linalg.norm(expected.drape.change), *apart])
@@ -225,6 +225,26 @@ def test_c_shows_what_is_outside_of_the_planes_that_jax_feels(forced, name, high
         assert np.mean(np.abs(found[on] - offset) < 2e-5) > 0.98
         assert np.mean(np.abs(found - (offset - depth) - deepest)[far] < 0.004) > 0.98
     assert touched > 100 and beyond > 20
+
+
+@pytest.mark.parametrize("moved, share", [(0.0, 0.95**15), (1e-3, 1.0)])
+def test_c_with_forces_comes_to_rest_as_the_model(forced, moved, share, motion):
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    model = of_eight_bits(forced["skip"])
+    packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 3))
+    free, slowed = (state._replace(drape=state.drape._replace(still=jnp.float32(n))) for n in (0, 74))
+    pose = at(motion, 3)
+    pose = Pose(pose.rotations, pose.translation + jnp.array([moved, 0.0, 0.0]))
+    free, slowed = (psi_ffi.step(packed, each, pose)[0] for each in (free, slowed))
+    low, high, _ = model.network.code_bounds
+    inside = (free.latent > low) & (free.latent < high) & (free.drape.change != 0.0)
+    assert inside.sum() > 15
+    free, slowed = free.drape, slowed.drape
+    np.testing.assert_allclose(slowed.change[inside], share * free.change[inside], rtol=1e-3, atol=1e-6)
+    assert (float(free.still), float(slowed.still)) == ((1.0, 75.0) if moved == 0.0 else (0.0, 0.0))
+    wind = psi_ffi.step(packed, state, at(motion, 3), external=jnp.array([1e-3, 0.0, 0.0]))[0]
+    assert wind.drape.still == 0.0
 
 
 def test_c_with_forces_is_c_inside_of_jax(library, forced, motion, tmp_path):

@@ -111,6 +111,32 @@ def test_a_motion_is_animated_with_an_acceleration_for_each_frame(model, motion)
     assert np.abs(pushed[4] - calm[4]).max() > 1e-4
 
 
+def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_it(model, motion):
+    """A random network never does by itself."""
+    state, changes = inference.initial_state(model, pose(motion, 0)), []
+    state = state._replace(drape=state.drape._replace(still=jnp.float32(0)))
+    wind, stands, tilted = jnp.array([1e-3, 0.0, 0.0]), pose(motion, 0), None
+
+    def change(state, pose, external=None):
+        return float(jnp.abs(inference.step(model, state, pose, False, external)[0].drape.change).max())
+
+    for frame in range(250):
+        awake = state._replace(drape=state.drape._replace(still=jnp.float32(0)))
+        free = change(awake, stands)
+        before = state
+        state, _ = inference.step(model, state, stands, False)
+        share = float(jnp.abs(state.drape.change).max()) / free
+        changes.append(free)
+        assert share == pytest.approx(0.95 ** max(0, frame + 1 - 60), rel=2e-2, abs=1e-3)
+    assert min(changes) > 1e-2 and inference.resting(before, state)
+    turned = stands.rotations.at[3].set(stands.rotations[3] @ jnp.array([[1.0, -1e-3, 0], [1e-3, 1, 0], [0, 0, 1]]))
+    tilted = Pose(turned, stands.translation)
+    shifted = Pose(stands.rotations, stands.translation + jnp.array([0.0, 0.0, 1e-3]))
+    for it in (change(state, tilted), change(state, shifted), change(state, stands, wind)):
+        assert it == pytest.approx(free, rel=0.5)
+    assert change(state, stands, 0 * wind) < 1e-3 * free
+
+
 def test_a_psi_without_forces_refuses_an_acceleration(motion):
     model = random_model(skip=True)
     state = inference.initial_state(model, pose(motion, 0))
