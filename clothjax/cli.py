@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 Arguments = TypeVar("Arguments")
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -51,6 +53,19 @@ def model_argument(parser: Parser, nargs: str | None = None, default: Any = None
         default=default,
         help="a run's folder, a packed folder, or the name of a garment that comes with clothjax" + about,
     )
+
+
+def betas(given: Sequence[float] | None, count: int) -> np.ndarray | None:
+    """Return the betas [count] of which a user gave the first ones, or None for the mean body.
+
+    Raises:
+        ValueError: for more of them than the body takes.
+    """
+    if given is None:
+        return None
+    if len(given) > count:
+        raise ValueError(f"--betas: {len(given)} given, this body takes {count}")
+    return np.array([*given, *[0.0] * (count - len(given))], np.float32)
 
 
 def refuse_old_spellings(

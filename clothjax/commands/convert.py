@@ -54,12 +54,8 @@ def main(argv: list[str]) -> None:
     options = Options(**{name: getattr(arguments, name) for name in Options._fields})
     formats.check(arguments.to, options)
     run = trained.find(arguments.model)
-    betas = None
-    if arguments.betas is not None:
-        count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]
-        if len(arguments.betas) > count:
-            raise ValueError(f"--betas: {len(arguments.betas)} given, this body takes {count}")
-        betas = np.array(arguments.betas + [0.0] * (count - len(arguments.betas)))
+    count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]
+    betas = cli.betas(arguments.betas, count)
     material = None if arguments.material is None else Material(*arguments.material)
     model = loading.load(run, betas=betas, material=material)
     form = FORMATS[arguments.to]

@@ -4,18 +4,25 @@
     python -m clothjax render runs/quickstart --motions walk_3 --out comparison.png
     python -m clothjax render skirt --motions dance_3 --out skirt.mp4
     python -m clothjax render skirt --motions walk_3 dance_3 --out skirt.usdc     # skirt_walk_3.usdc and so on
+    python -m clothjax render skirt --motions dance_3 --out skirt.glb --skinned
 
 The suffix of --out chooses the format. .webp and .mp4 are films of Psi on the body. .glb, .usdc, .usda and .obj hold
 garment and body as meshes, .obj with one file a frame. .pc2 and .mdd hold the garment's vertices alone, beside an .obj
 of the mesh to put them on. .png compares skinning, Phi, Psi and the reference solver on a clip that `clothjax evaluate`
 has measured. Each of several motions gets its own file.
+
+With --skinned a .glb is for engines: body and garment are skinned meshes on one skeleton. The motion animates joints,
+and morph targets for the garment's folds. Without --motions it has the canonical pose alone.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from clothjax import cli
-from clothjax.evaluation.pictures import WRITERS, perform, write_comparison
+from clothjax.evaluation.pictures import WRITERS, perform, perform_skinned, write_comparison
 from clothjax.evaluation.rollouts import load_run
+from clothjax.render.skinned_gltf import to_skinned_glb
 from clothjax.runtime import trained
 
 
@@ -28,17 +35,29 @@ def main(argv: list[str]) -> None:
     parser = cli.Parser("clothjax render", __doc__)
     cli.model_argument(parser)
     parser.add_argument(
-        "--motions", nargs="+", default=None, help="asset names or paths; default: the first configured one"
+        "--motions",
+        nargs="+",
+        default=None,
+        help="asset names or paths; default: the first configured one, with --skinned none",
     )
     parser.add_argument("--out", type=Path, required=True, help=f"a file of .png, {', '.join(WRITERS)}")
     parser.add_argument("--frames", type=int, default=None, help="at the most; default: the configured number")
+    parser.add_argument("--skinned", action="store_true", help="write a .glb with a skeleton")
+    parser.add_argument(
+        "--betas", type=float, nargs="+", default=None, help="of the body, with --skinned; default: the mean body"
+    )
     arguments = parser.parse_args(argv)
     kind = arguments.out.suffix
     if kind != ".png" and kind not in WRITERS:
         raise ValueError(f"{arguments.out}: cannot write {kind!r}; allowed: .png, {', '.join(WRITERS)}")
+    if arguments.skinned and kind != ".glb":
+        raise ValueError(f"{arguments.out}: --skinned is of .glb, not of {kind}")
+    if arguments.betas and not arguments.skinned:
+        raise ValueError("--betas is of --skinned; other files show the body of the evaluation")
     run = trained.find(arguments.model)
     experiment, _ = load_run(run)
-    motions = arguments.motions or experiment.config.evaluation.motions[:1]
+    first = [None] if arguments.skinned else experiment.config.evaluation.motions[:1]
+    motions: Sequence[Any] = arguments.motions or first
     frames = arguments.frames or experiment.config.evaluation.animation_frames
     outs = {motion: _out(arguments.out, motion if len(motions) > 1 else None) for motion in motions}
     if len(set(outs.values())) < len(motions):
@@ -47,6 +66,9 @@ def main(argv: list[str]) -> None:
     for motion, out in outs.items():
         if kind == ".png":
             write_comparison(run, experiment, motion, out)
+        elif arguments.skinned:
+            betas = cli.betas(arguments.betas, experiment.body.shapedirs.shape[-1])
+            to_skinned_glb(out, perform_skinned(run, experiment, motion, frames, betas))
         else:
             WRITERS[kind](out, perform(run, experiment, motion, frames))
         print(f"written to {out.with_name(f'{out.stem}_NNNN.obj') if kind == '.obj' else out}")

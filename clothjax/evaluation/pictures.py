@@ -12,13 +12,13 @@ from clothjax.evaluation import rollouts
 from clothjax.evaluation.rollouts import Tracks, load_run, psi_trajectory, windows
 from clothjax.networks.animators import phi_animator
 from clothjax.progress import progress_bar
-from clothjax.render import gltf, point_cache, ray_cast, usd
-from clothjax.render.performance import Part, Performance
+from clothjax.render import gltf, point_cache, ray_cast, skinned_gltf, usd
+from clothjax.render.performance import Part, Performance, SkinnedPart, SkinnedPerformance
 from clothjax.render.ray_cast import CLOTH, SKIN, Surface
 from clothjax.runtime import loading
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
-from clothjax.types import Motion, Pose
+from clothjax.types import Array, Body, Motion, Pose
 
 GALLERY_MOTIONS = ("walk_3", "dance_3", "run_3")
 GALLERY_BODIES = ("thin", "mean", "heavy")
@@ -84,6 +84,55 @@ def perform(run: Path, experiment: Experiment, motion: str, frames: int) -> Perf
         Part("garment", garment, np.asarray(experiment.garment.faces), CLOTH),
     )
     return Performance(parts if experiment.scene.touchable else parts[1:], root[:frames], clip.fps)
+
+
+def perform_skinned(
+    run: Path, experiment: Experiment, motion: str | None, frames: int, betas: np.ndarray | None = None
+) -> SkinnedPerformance:
+    """Roll Psi out as `perform` does, on the body's skeleton; without a motion, return the canonical pose alone.
+
+    In motion, each vertex of the garment keeps four joints, as many as every engine has. Its canonical place is the one
+    that these carry to what Psi shows.
+
+    Args:
+        betas: [S]; default: the mean body, as of an exported model.
+    """
+    body, weights = experiment.body, np.asarray(experiment.garment.weights)
+    shape = jnp.zeros(body.shapedirs.shape[-1]) if betas is None else jnp.asarray(betas, jnp.float32)
+    joints, skin = skinning.shaped_joints(body, shape), skinning.shaped_vertices(body, shape)
+    corrected, cloth, clip = skin[None], skinning.shaped_vertices(experiment.garment, shape)[None], None
+    if motion is not None:
+        clip = assembly.motion(experiment, motion)
+        shown = psi_trajectory(loading.load(run, betas=betas), clip)[:frames]
+        root = np.asarray(clip.translation[1:-1][:frames])
+        clip = Motion(np.asarray(clip.rotations[1:-1][:frames], np.float32), root - root[0], clip.fps)
+        weights = skinned_gltf.largest(weights, skinned_gltf.SET).astype(np.float32)
+        cloth = np.stack(list(map(_unskinned(body, joints, weights), clip.rotations, shown)))
+        if body.posedirs is not None:
+            poses = Pose(jnp.asarray(clip.rotations), jnp.zeros_like(root))
+            corrected = jax.vmap(lambda pose: skinning.pose_corrected(body.posedirs, skin, pose))(poses)
+    parts = (
+        SkinnedPart("body", np.asarray(corrected), np.asarray(body.faces), np.asarray(body.weights), SKIN),
+        SkinnedPart("garment", np.asarray(cloth), np.asarray(experiment.garment.faces), weights, CLOTH),
+    )
+    parts = parts if experiment.scene.touchable else parts[1:]
+    return SkinnedPerformance(parts, experiment.names, np.asarray(body.parents), np.asarray(joints), clip)
+
+
+def _unskinned(body: Body, joints: Array, weights: np.ndarray) -> Callable:
+    """Return a function from rotations [J, 3, 3] and posed vertices [V, 3] m to the canonical ones [V, 3] m.
+
+    Args:
+        joints: [J, 3] m in the canonical pose.
+        weights: [V, J] skinning weights.
+    """
+
+    @jax.jit
+    def unskinned(rotations, posed):
+        transforms = skinning.joint_transforms(rotations, joints, body.parents)
+        return skinning.unapply(skinning.blend(jnp.asarray(weights), transforms), posed)
+
+    return unskinned
 
 
 def film(write: Callable) -> Callable:

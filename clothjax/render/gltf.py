@@ -8,7 +8,7 @@ import numpy as np
 from clothjax.render.performance import Performance
 from clothjax.render.ray_cast import vertex_normals
 
-FLOAT, UNSIGNED = 5126, 5125
+COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}  # glTF's numbers of types
 POSITIONS, INDICES = 34962, 34963  # buffer targets
 
 
@@ -21,52 +21,16 @@ def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-
     Raises:
         ImportError: if pygltflib is not installed.
     """
-    try:
-        import pygltflib as gltf
-    except ImportError as error:
-        raise ImportError("glTF needs pygltflib: pip install clothjax[render]") from error
-    writer = _Buffer(gltf)
-    frames = np.arange(len(performance.root), dtype=np.float32)
-    times = writer.add(frames / np.float32(performance.fps), "SCALAR", bounds=True)
-    meshes, materials, nodes, channels, samplers, errors = [], [], [], [], [], {}
-    translations = writer.add(np.asarray(performance.root, np.float32), "VEC3")
-    for index, part in enumerate(performance.parts):
+    document, errors = Document(), {}
+    times = document.times(len(performance.root), performance.fps)
+    translations = document.add(np.asarray(performance.root, np.float32), "VEC3")
+    for part in performance.parts:
         mean, targets, weights, errors[part.name] = principal_components(part.vertices, tolerance, most)
-        attributes = gltf.Attributes(
-            POSITION=writer.add(mean, "VEC3", POSITIONS, bounds=True),
-            NORMAL=writer.add(vertex_normals(mean, part.faces), "VEC3", POSITIONS),
-        )
-        corners = writer.add(np.asarray(part.faces, np.uint32).reshape(-1), "SCALAR", INDICES)
-        morphs: list[Any] = [  # dicts, which pygltflib writes as they are
-            {
-                "POSITION": writer.add(target, "VEC3", POSITIONS, bounds=True),
-                "NORMAL": writer.add(_normal_change(mean, target, part.faces), "VEC3", POSITIONS),
-            }
-            for target in targets
-        ]
-        primitive = gltf.Primitive(attributes=attributes, indices=corners, material=index)
-        primitive.targets = morphs  # pyright: ignore[reportAttributeAccessIssue]  # dictionaries are written as they are
-        meshes.append(gltf.Mesh(name=part.name, primitives=[primitive], weights=[0.0] * len(targets)))
-        nodes.append(gltf.Node(name=part.name, mesh=index))
-        base = gltf.PbrMetallicRoughness(baseColorFactor=[*part.colour, 1.0], metallicFactor=0.0, roughnessFactor=0.9)
-        materials.append(gltf.Material(name=part.name, pbrMetallicRoughness=base, doubleSided=True))
-        for values, kind in ((translations, "translation"), (writer.add(weights.reshape(-1), "SCALAR"), "weights")):
-            samplers.append(gltf.AnimationSampler(input=times, output=values, interpolation="LINEAR"))
-            target = gltf.AnimationChannelTarget(node=index, path=kind)
-            channels.append(gltf.AnimationChannel(sampler=len(samplers) - 1, target=target))
-    document = gltf.GLTF2(
-        scene=0,
-        scenes=[gltf.Scene(nodes=list(range(len(nodes))))],
-        nodes=nodes,
-        meshes=meshes,
-        materials=materials,
-        animations=[gltf.Animation(name="motion", samplers=samplers, channels=channels)],
-        accessors=writer.accessors,
-        bufferViews=writer.views,
-        buffers=[gltf.Buffer(byteLength=len(writer.data))],
-    )
-    document.set_binary_blob(bytes(writer.data))
-    document.save_binary(str(path))
+        mesh = document.mesh(part.name, mean, part.faces, part.colour, targets)
+        node = document.node(name=part.name, mesh=mesh)
+        document.animate(node, "translation", times, translations)
+        document.animate(node, "weights", times, document.add(weights.reshape(-1), "SCALAR"))
+    document.save(path)
     return errors
 
 
@@ -81,7 +45,7 @@ def principal_components(vertices: np.ndarray, tolerance: float, most: int) -> C
         most: number that is not exceeded.
 
     Returns:
-        Mean [N, 3] m, components [K, N, 3], weights [T, K] in m, and the largest vertex error in m.
+        Mean [N, 3] m, components [K, N, 3] m, weights [T, K] in [-1, 1], and the largest vertex error in m.
     """
     vertices = np.asarray(vertices, np.float64)
     mean = vertices.mean(axis=0)
@@ -93,13 +57,125 @@ def principal_components(vertices: np.ndarray, tolerance: float, most: int) -> C
         error = float(np.linalg.norm(rebuilt - vertices, axis=-1).max())
         if error <= tolerance:
             break
-    components = right[:count].reshape(count, *mean.shape)
+    largest = np.maximum(np.abs(weights[:, :count]).max(axis=0), 1e-12)  # some engines clamp weights
+    components = (largest[:, None] * right[:count]).reshape(count, *mean.shape)
     return (
         mean.astype(np.float32),
         components.astype(np.float32),
-        weights[:, :count].astype(np.float32),
+        (weights[:, :count] / largest).astype(np.float32),
         error,
     )
+
+
+class Document:
+    """A glTF under construction: nodes, meshes, one animation, and the numbers behind them.
+
+    Raises:
+        ImportError: if pygltflib is not installed.
+    """
+
+    def __init__(self):
+        try:
+            import pygltflib as gltf
+        except ImportError as error:
+            raise ImportError("glTF needs pygltflib: pip install clothjax[render]") from error
+        self.gltf, self.data, self.file = gltf, bytearray(), gltf.GLTF2(scene=0)
+        self.animation = gltf.Animation(name="motion")
+
+    def add(self, array: np.ndarray, kind: str, target: int | None = None, bounds: bool = False) -> int:
+        """Append an array of a type of `COMPONENTS`; return the index of its accessor.
+
+        Args:
+            kind: of an element, such as VEC3.
+            target: of the buffer, for what a mesh is made of.
+            bounds: whether to write the least and the largest element.
+        """
+        array = np.ascontiguousarray(array)
+        while len(self.data) % 4:
+            self.data += b"\0"
+        view = self.gltf.BufferView(buffer=0, byteOffset=len(self.data), byteLength=array.nbytes, target=target)
+        self.file.bufferViews.append(view)
+        self.data += array.tobytes()
+        rows = array.reshape(len(array), -1)
+        self.file.accessors.append(
+            self.gltf.Accessor(
+                bufferView=len(self.file.bufferViews) - 1,
+                componentType=COMPONENTS[array.dtype.name],
+                count=len(array),
+                type=kind,
+                min=rows.min(axis=0).tolist() if bounds else None,
+                max=rows.max(axis=0).tolist() if bounds else None,
+            )
+        )
+        return len(self.file.accessors) - 1
+
+    def node(self, **fields: Any) -> int:
+        """Append a node; return its index."""
+        self.file.nodes.append(self.gltf.Node(**fields))
+        return len(self.file.nodes) - 1
+
+    def mesh(
+        self,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        colour: tuple[float, float, float],
+        targets: np.ndarray,
+        **attributes: int,
+    ) -> int:
+        """Append a mesh with a material of its own; return its index.
+
+        Args:
+            vertices: [N, 3] m.
+            faces: [F, 3].
+            colour: red, green, blue in [0, 1].
+            targets: [K, N, 3] m, morph targets.
+            attributes: more of them by name, as accessors.
+        """
+        gltf, vertices = self.gltf, np.asarray(vertices, np.float32)
+        index = np.uint16 if len(vertices) < 2**16 else np.uint32
+        primitive = gltf.Primitive(
+            attributes=gltf.Attributes(
+                POSITION=self.add(vertices, "VEC3", POSITIONS, bounds=True),
+                NORMAL=self.add(vertex_normals(vertices, faces).astype(np.float32), "VEC3", POSITIONS),
+                **attributes,
+            ),
+            indices=self.add(np.asarray(faces, index).reshape(-1), "SCALAR", INDICES),
+            material=len(self.file.materials),
+        )
+        morphs: list[Any] = [  # dicts, which pygltflib writes as they are
+            {
+                "POSITION": self.add(target, "VEC3", POSITIONS, bounds=True),
+                "NORMAL": self.add(_normal_change(vertices, target, faces), "VEC3", POSITIONS),
+            }
+            for target in targets
+        ]
+        primitive.targets = morphs
+        self.file.meshes.append(gltf.Mesh(name=name, primitives=[primitive], weights=[0.0] * len(targets)))
+        base = gltf.PbrMetallicRoughness(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.9)
+        self.file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=base, doubleSided=True))
+        return len(self.file.meshes) - 1
+
+    def times(self, frames: int, fps: float) -> int:
+        """Append the times in s of frames; return the index of their accessor."""
+        return self.add(np.arange(frames, dtype=np.float32) / np.float32(fps), "SCALAR", bounds=True)
+
+    def animate(self, node: int, path: str, times: int, values: int) -> None:
+        """Animate a property of a node, such as its rotation, linearly between the values of an accessor."""
+        sampler = self.gltf.AnimationSampler(input=times, output=values, interpolation="LINEAR")
+        target = self.gltf.AnimationChannelTarget(node=node, path=path)
+        self.animation.channels.append(self.gltf.AnimationChannel(sampler=len(self.animation.samplers), target=target))
+        self.animation.samplers.append(sampler)
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, with a scene of the nodes that are no other's children."""
+        children = {child for node in self.file.nodes for child in node.children or ()}
+        roots = [index for index in range(len(self.file.nodes)) if index not in children]
+        self.file.scenes = [self.gltf.Scene(nodes=roots)]
+        self.file.animations = [self.animation] if self.animation.channels else []
+        self.file.buffers = [self.gltf.Buffer(byteLength=len(self.data))]
+        self.file.set_binary_blob(bytes(self.data))
+        self.file.save_binary(str(path))
 
 
 def _normal_change(mean: np.ndarray, target: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -107,32 +183,3 @@ def _normal_change(mean: np.ndarray, target: np.ndarray, faces: np.ndarray) -> n
     step = 1e-3 / max(float(np.abs(target).max()), 1e-12)
     change = vertex_normals(mean + step * target, faces) - vertex_normals(mean, faces)
     return (change / step).astype(np.float32)
-
-
-class _Buffer:
-    """Binary part of a glTF under construction."""
-
-    def __init__(self, gltf):
-        self.gltf, self.data, self.views, self.accessors = gltf, bytearray(), [], []
-
-    def add(self, array: np.ndarray, kind: str, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array; return the index of its accessor."""
-        array = np.ascontiguousarray(array)
-        while len(self.data) % 4:
-            self.data += b"\0"
-        self.views.append(
-            self.gltf.BufferView(buffer=0, byteOffset=len(self.data), byteLength=array.nbytes, target=target)
-        )
-        self.data += array.tobytes()
-        rows = array.reshape(len(array), -1)
-        self.accessors.append(
-            self.gltf.Accessor(
-                bufferView=len(self.views) - 1,
-                componentType=UNSIGNED if array.dtype == np.uint32 else FLOAT,
-                count=len(array),
-                type=kind,
-                min=rows.min(axis=0).tolist() if bounds else None,
-                max=rows.max(axis=0).tolist() if bounds else None,
-            )
-        )
-        return len(self.accessors) - 1
