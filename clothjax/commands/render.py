@@ -15,9 +15,7 @@ With --skinned a .glb is for engines: body and garment are skinned meshes on one
 and morph targets for the garment's folds. Without --motions it has the canonical pose alone.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from clothjax import cli
 from clothjax.evaluation.pictures import WRITERS, perform, perform_skinned, write_comparison
@@ -56,8 +54,7 @@ def main(argv: list[str]) -> None:
         raise ValueError("--betas is of --skinned; other files show the body of the evaluation")
     run = trained.find(arguments.model)
     experiment, _ = load_run(run)
-    first = [None] if arguments.skinned else experiment.config.evaluation.motions[:1]
-    motions: Sequence[Any] = arguments.motions or first
+    motions = arguments.motions or experiment.config.evaluation.motions[:1]
     frames = arguments.frames or experiment.config.evaluation.animation_frames
     outs = {motion: _out(arguments.out, motion if len(motions) > 1 else None) for motion in motions}
     if len(set(outs.values())) < len(motions):
@@ -68,7 +65,8 @@ def main(argv: list[str]) -> None:
             write_comparison(run, experiment, motion, out)
         elif arguments.skinned:
             betas = cli.betas(arguments.betas, experiment.body.shapedirs.shape[-1])
-            to_skinned_glb(out, perform_skinned(run, experiment, motion, frames, betas))
+            played = motion if arguments.motions else None
+            to_skinned_glb(out, perform_skinned(run, experiment, played, frames, betas))
         else:
             WRITERS[kind](out, perform(run, experiment, motion, frames))
         print(f"written to {out.with_name(f'{out.stem}_NNNN.obj') if kind == '.obj' else out}")

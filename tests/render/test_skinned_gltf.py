@@ -1,5 +1,9 @@
 """A skinned glTF, read and posed by the rules of glTF 2.0 alone, is what the runtime shows."""
 
+import json
+import shutil
+import subprocess
+
 import jax.numpy as jnp
 import numpy as np
 import pygltflib
@@ -309,6 +313,42 @@ def test_the_khronos_validator_finds_nothing(tmp_path, khronos, motions):
     render.main(["skirt", *motions, "--out", str(tmp_path / "g.glb"), "--skinned"])
     issues = khronos(tmp_path / "g.glb")
     assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"][:5]
+
+
+PLAY = """
+import { readFileSync } from "node:fs";
+import * as three from "three";
+import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
+globalThis.self = globalThis;
+const [path, time] = process.argv.slice(2);
+const gltf = await new GLTFLoader().parseAsync(Uint8Array.from(readFileSync(path)).buffer, "");
+const mixer = new three.AnimationMixer(gltf.scene);
+mixer.clipAction(gltf.animations[0]).play();
+mixer.setTime(Number(time));
+gltf.scene.updateMatrixWorld(true);
+const garment = gltf.scene.getObjectByName("garment");
+const point = new three.Vector3(), vertices = [];
+for (let i = 0; i < garment.geometry.attributes.position.count; i++) {
+  garment.getVertexPosition(i, point);
+  vertices.push(point.applyMatrix4(garment.matrixWorld).toArray());
+}
+console.log(JSON.stringify(vertices));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("npm") is None, reason="needs Node")
+def test_three_js_shows_what_the_runtime_shows(tmp_path, run, clip):
+    """Also between two frames, for it blends joints and morph targets."""
+    subprocess.run(["npm", "install", "--silent", "three"], check=True, cwd=tmp_path)
+    (tmp_path / "play.mjs").write_text(PLAY)
+    render.main(["skirt", "--motions", "dance_3", "--frames", "60", "--out", str(tmp_path / "a.glb"), "--skinned"])
+    shown = np.asarray(inference.animate(loading.load(run), clip)[0])
+    for frame in (17, 40.5):
+        command = ["node", "play.mjs", "a.glb", str(frame / 30)]
+        done = subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, text=True)
+        between = shown[int(frame)] + frame % 1 * (shown[int(frame) + 1] - shown[int(frame)])
+        assert apart(np.array(json.loads(done.stdout)), between) < 1.5e-3
 
 
 @pytest.mark.slow
