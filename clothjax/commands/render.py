@@ -66,7 +66,8 @@ def main(argv: list[str]) -> None:
         elif arguments.skinned:
             betas = cli.betas(arguments.betas, experiment.body.shapedirs.shape[-1])
             played = motion if arguments.motions else None
-            to_skinned_glb(out, perform_skinned(run, experiment, played, frames, betas))
+            errors = to_skinned_glb(out, perform_skinned(run, experiment, played, frames, betas))
+            print(f"morph targets err by {1e3 * max(errors.values()):.2f} mm at most")
         else:
             WRITERS[kind](out, perform(run, experiment, motion, frames))
         print(f"written to {out.with_name(f'{out.stem}_NNNN.obj') if kind == '.obj' else out}")

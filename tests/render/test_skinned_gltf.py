@@ -1,6 +1,7 @@
 """A skinned glTF, read and posed by the rules of glTF 2.0 alone, is what the runtime shows."""
 
 import json
+import re
 import shutil
 import subprocess
 
@@ -201,11 +202,12 @@ def test_without_a_motion_there_is_the_canonical_pose_alone(resting, experiment)
         np.testing.assert_array_equal(faces, expected.faces)
 
 
-def test_another_body_has_another_skeleton(tmp_path, run, experiment, clip):
+def test_another_body_has_another_skeleton(tmp_path, run, experiment, clip, capsys):
     betas = np.zeros(10, np.float32)
     betas[:2] = 2.0, -1.0
     command = ["skirt", "--motions", "dance_3", "--frames", "18", "--skinned", "--betas", "2", "-1"]
     render.main([*command, "--out", str(tmp_path / "a.glb")])
+    assert 0.1 < float(re.search(r"err by (\S+) mm at most", capsys.readouterr().out)[1]) <= 1.0
     reader, model = Reader(tmp_path / "a.glb"), loading.load(run, betas=betas)
     places = np.linalg.inv(reader.bind())[:, :3, 3]
     np.testing.assert_allclose(places, model.wearer.joints, atol=1e-6)
