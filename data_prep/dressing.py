@@ -3,16 +3,13 @@
 import igl
 import numpy as np
 
-from clothjax.config import HANDS
 from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body, Garment
 from data_prep.diffusion import diffuse
-from data_prep.skeleton import cmu_names
+from data_prep.skeleton import ancestors, landmarks
 
 WINDING = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
 CLEARANCE = 0.004  # m, between garment and body
-FOREARM = ("forearm", *HANDS)
-ARM = ("leftarm", "rightarm", *FOREARM)
 ON_SKIN = 1e-7  # m; nearer points take the normal of the skin as their way out
 
 
@@ -63,16 +60,18 @@ def outward(points: np.ndarray, body: np.ndarray, triangles: np.ndarray) -> tupl
     return signed, away
 
 
-def limbs(body: Body, names: tuple[str, ...], parts: tuple[str, ...], share: float = 0.3) -> np.ndarray:
-    """Return the vertices of the body [B] bool that belong to some of its limbs.
+def limbs(body: Body, names: tuple[str, ...], bone: str, share: float = 0.3) -> np.ndarray:
+    """Return the vertices of the body [B] bool that belong to a bone of either side, or to what hangs on it.
 
     Args:
         body: with skinning weights.
         names: of its joints.
-        parts: words in the CMU names, in lower case, of the limbs' joints.
+        bone: CMU's name without the side, such as `ForeArm`.
         share: least sum of the weights of these joints.
     """
-    chosen = [any(part in name.lower() for part in parts) for name in cmu_names(names)]
+    known = landmarks(names, body.parents)
+    roots = {known[side + bone] for side in ("Left", "Right") if side + bone in known}
+    chosen = [bool(roots & set(ancestors(joint, body.parents))) for joint in range(len(names))]
     return np.asarray(body.weights)[:, chosen].sum(axis=1) > share
 
 

@@ -1,4 +1,4 @@
-"""glTF 2.0 files (.glb, .gltf): their meshes as they stand in the scene, skinned ones as their skeleton stands.
+"""glTF 2.0 files (.glb, .gltf, .vrm): their meshes as they stand in the scene, and how animations move its nodes.
 
 Read are nodes, skins, default morph weights, sparse and normalised accessors. What is compressed is refused by name.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -19,6 +19,16 @@ READ = ("KHR_mesh_quantization", "KHR_texture", "KHR_lights", "KHR_materials", "
 GLB = b"glTF"
 TRIANGLES = 4  # the mode of a primitive; strips and fans follow
 MOST = 10_000_000  # entries of an accessor
+MOST_FRAMES = 200_000  # of an animation: two hours at 30 a second
+
+
+class Skinned(NamedTuple):
+    """How joints carry the vertices of a part."""
+
+    skin: int
+    bound: np.ndarray  # [V, 3] as the mesh has them, with its default morph weights
+    joints: np.ndarray  # [V, n] int64, among those of the skin
+    weights: np.ndarray  # [V, n], of sum 1 or 0
 
 
 class Part(NamedTuple):
@@ -28,6 +38,8 @@ class Part(NamedTuple):
     vertices: np.ndarray  # [V, 3]
     faces: np.ndarray  # [F, 3]
     colours: np.ndarray | None  # [V, 3], 0 to 1
+    skinned: Skinned | None
+    morphs: dict[str, np.ndarray]  # [V, 3] by name, as the mesh has them
 
 
 class Document:
@@ -108,22 +120,109 @@ class Document:
         if roots is None:
             children = {child for node in self.entries("nodes") for child in node.get("children", ())}
             roots = [i for i in range(len(self.entries("nodes"))) if i not in children]
-        found, open_nodes = {}, [(root, np.eye(4)) for root in roots]
+        found, open_nodes = {}, [(root, np.eye(4)) for root in reversed(roots)]
         while open_nodes:
             index, above = open_nodes.pop()
             if index in found:
                 raise ValueError(f"node {index} has two parents")
             found[index] = above @ local(self.entries("nodes")[index])
-            open_nodes += [(child, found[index]) for child in self.entries("nodes")[index].get("children", ())]
+            children = self.entries("nodes")[index].get("children", ())
+            open_nodes += [(child, found[index]) for child in reversed(children)]
         return found
 
     def skin_transforms(self, index: int, places: dict[int, np.ndarray]) -> np.ndarray:
         """Return the matrices [J, 4, 4] of the joints of a skin, from its mesh to the world."""
-        skin = self.entries("skins")[index]
-        joints = np.stack([places[joint] for joint in skin["joints"]])
-        if "inverseBindMatrices" not in skin:
-            return joints
-        return joints @ self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2).astype(np.float64)
+        joints = np.stack([places[joint] for joint in self.entries("skins")[index]["joints"]])
+        inverse = self.inverse_bind(index)
+        return joints if inverse is None else joints @ inverse
+
+    def inverse_bind(self, index: int) -> np.ndarray | None:
+        """Return the matrices [J, 4, 4] from the mesh of a skin to its joints, as they were when it was bound."""
+        accessor = self.entries("skins")[index].get("inverseBindMatrices")
+        if accessor is None:
+            return None
+        return self.accessor(accessor).reshape(-1, 4, 4).swapaxes(1, 2).astype(np.float64)
+
+    def moved(self, index: int, fps: float, wanted: set[int]) -> dict[int, np.ndarray]:
+        """Return the matrices [T, 4, 4] of nodes in the scene over an animation, as `places`, from its first key on.
+
+        Args:
+            index: of the animation.
+            fps: frames a second.
+            wanted: the nodes, and whatever they hang on.
+        """
+        animation, moves = self.entries("animations")[index], {}
+        for channel in animation["channels"]:
+            node, kind = channel["target"].get("node"), channel["target"]["path"]
+            if node in wanted and kind != "weights":
+                sampler = animation["samplers"][channel["sampler"]]
+                keys = self.accessor(sampler["input"])[:, 0].astype(np.float64)
+                values = self.accessor(sampler["output"]).astype(np.float64)
+                moves[node, kind] = keys, values, sampler.get("interpolation", "LINEAR")
+        if not moves:
+            return {}
+        start, end = (f(f(keys) for keys, *_ in moves.values()) for f in (min, max))
+        if not 0 <= (end - start) * fps <= MOST_FRAMES:
+            raise ValueError(f"an animation of {end - start:.3g} s has more than {MOST_FRAMES} frames")
+        times = start + np.arange(int(np.floor((end - start) * fps + 1e-3)) + 1) / fps
+        found: dict[int, np.ndarray] = {}
+        for node in self.places():
+            if node not in wanted:
+                continue
+            own = {kind: _sampled(times, *moves[node, kind]) for at, kind in moves if at == node}
+            still = self.entries("nodes")[node]
+            matrices = np.tile(local(still), (len(times), 1, 1)) if not own else _composed(own, still, len(times))
+            parent = self.parent(node)
+            found[node] = matrices if parent is None else found[parent] @ matrices
+        return found
+
+    def above(self, node: int) -> list[int]:
+        """Return a node and those that it hangs on, up to the scene."""
+        chain = [node]
+        while (parent := self.parent(chain[-1])) is not None:
+            chain.append(parent)
+        return chain
+
+    def parent(self, node: int) -> int | None:
+        """Return the node that carries another."""
+        return next((i for i, other in enumerate(self.entries("nodes")) if node in other.get("children", ())), None)
+
+
+def _composed(moves: dict[str, np.ndarray], node: dict[str, Any], frames: int) -> np.ndarray:
+    """Return matrices [T, 4, 4] of a node that some channels move: `translation`, `rotation` or `scale` by frame."""
+    parts = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
+    parts = {kind: moves.get(kind, np.tile(node.get(kind, still), (frames, 1))) for kind, still in parts.items()}
+    result = np.tile(np.eye(4), (frames, 1, 1))
+    result[:, :3, :3] = Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"][:, None]
+    result[:, :3, 3] = parts["translation"]
+    return result
+
+
+def _sampled(times: np.ndarray, keys: np.ndarray, values: np.ndarray, how: str) -> np.ndarray:
+    """Return the values [T, n] of a channel at times [T] s.
+
+    Args:
+        keys: [K] s.
+        values: [K, n]; of a cubic spline [3 K, n]: tangent, value and tangent of each key.
+        how: STEP, LINEAR or CUBICSPLINE.
+    """
+    times = np.clip(times, keys[0], keys[-1])
+    if how == "CUBICSPLINE":
+        before, middle, after = values.reshape(len(keys), 3, -1).swapaxes(0, 1)
+        if len(keys) == 1:
+            return np.tile(middle, (len(times), 1))
+        low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 2)
+        width = keys[low + 1] - keys[low]
+        s = ((times - keys[low]) / width)[:, None]
+        ends = (2 * s**3 - 3 * s**2 + 1) * middle[low] + (3 * s**2 - 2 * s**3) * middle[low + 1]
+        slopes = (s**3 - 2 * s**2 + s) * after[low] + (s**3 - s**2) * before[low + 1]
+        return ends + width[:, None] * slopes
+    low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 1)
+    if how == "STEP" or len(keys) == 1:
+        return values[low]
+    if values.shape[1] == 4:
+        return Slerp(keys, Rotation.from_quat(values))(times).as_quat()
+    return np.stack([np.interp(times, keys, column) for column in values.T], axis=1)
 
 
 def local(node: dict[str, Any]) -> np.ndarray:
@@ -137,20 +236,18 @@ def local(node: dict[str, Any]) -> np.ndarray:
     return result
 
 
-def parts(path: str | Path) -> list[Part]:
-    """Read the triangles of all objects of a file.
+def parts(document: Document) -> list[Part]:
+    """Read the triangles of all objects in the scene of a file.
 
     Raises:
-        ValueError: as `Document`, and for strips and fans of triangles.
+        ValueError: for strips and fans of triangles, or data that are cut short.
     """
-    document = Document(path)
     places, found = document.places(), []
     for index, place in places.items():
         node = document.entries("nodes")[index]
         if "mesh" not in node:
             continue
         mesh = document.entries("meshes")[node["mesh"]]
-        weights = node.get("weights", mesh.get("weights", ()))
         for primitive in mesh["primitives"]:
             attributes = primitive["attributes"]
             mode = primitive.get("mode", TRIANGLES)
@@ -159,12 +256,13 @@ def parts(path: str | Path) -> list[Part]:
             if mode > TRIANGLES:
                 raise ValueError("strips or fans of triangles: export it as triangles")
             vertices = document.accessor(attributes["POSITION"]).astype(np.float64)
-            for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
-                if "POSITION" in target:
-                    vertices = vertices + weight * document.accessor(target["POSITION"])
+            morphs = _morphs(document, mesh, primitive)
+            for weight, morph in zip(node.get("weights", mesh.get("weights", ())), morphs.values(), strict=False):
+                vertices = vertices + weight * morph
+            skinned = None
             if "skin" in node and "JOINTS_0" in attributes:  # its node does not move a skinned mesh
-                matrices = document.skin_transforms(node["skin"], places)
-                vertices = _skinned(vertices, document, attributes, matrices)
+                skinned = _skinned(document, node["skin"], attributes, vertices)
+                vertices = carried(skinned, document.skin_transforms(node["skin"], places))
             else:
                 vertices = vertices @ place[:3, :3].T + place[:3, 3]
             count = len(vertices)
@@ -174,19 +272,35 @@ def parts(path: str | Path) -> list[Part]:
             material = primitive.get("material")
             names = (node.get("name"), mesh.get("name"))
             names += (None if material is None else document.entries("materials")[material].get("name"),)
-            found.append(Part(tuple(name for name in names if name), vertices, faces, colours))
+            found.append(Part(tuple(name for name in names if name), vertices, faces, colours, skinned, morphs))
     return found
 
 
-def _skinned(vertices: np.ndarray, document: Document, attributes: dict, matrices: np.ndarray) -> np.ndarray:
-    """Return vertices [V, 3] as the joints carry them."""
-    blended, total = np.zeros((len(vertices), 4, 4)), np.zeros(len(vertices))
+def _morphs(document: Document, mesh: dict, primitive: dict) -> dict[str, np.ndarray]:
+    """Return what the morph targets of a primitive add to its vertices, [V, 3] by name."""
+    names, morphs = mesh.get("extras", {}).get("targetNames", []), {}
+    for number, target in enumerate(primitive.get("targets", ())):
+        count = document.entries("accessors")[primitive["attributes"]["POSITION"]]["count"]
+        added = document.accessor(target["POSITION"]) if "POSITION" in target else np.zeros((count, 3))
+        name = names[number] if number < len(names) else f"morph_{number}"
+        morphs[f"{name}_{number}" if name in morphs else name] = added.astype(np.float64)
+    return morphs
+
+
+def _skinned(document: Document, skin: int, attributes: dict, vertices: np.ndarray) -> Skinned:
+    joints, weights = [], []
     for group in range(4):
         if f"JOINTS_{group}" not in attributes:
             break
-        joints = document.accessor(attributes[f"JOINTS_{group}"]).astype(np.int64)
-        weights = document.accessor(attributes[f"WEIGHTS_{group}"]).astype(np.float64)
-        blended += np.einsum("vk,vkab->vab", weights, matrices[joints])
-        total += weights.sum(axis=1)
-    moved = np.einsum("vab,vb->va", blended[:, :3], np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1))
-    return moved / np.where(total > 0, total, 1.0)[:, None]
+        joints.append(document.accessor(attributes[f"JOINTS_{group}"]).astype(np.int64))
+        weights.append(document.accessor(attributes[f"WEIGHTS_{group}"]).astype(np.float64))
+    joints, weights = (np.concatenate(each, axis=1) for each in (joints, weights))
+    total = weights.sum(axis=1, keepdims=True)
+    return Skinned(skin, vertices, joints, weights / np.where(total > 0, total, 1.0))
+
+
+def carried(skinned: Skinned, matrices: np.ndarray) -> np.ndarray:
+    """Return the vertices [V, 3] of a skinned part, as the matrices [J, 4, 4] of its skin's joints carry them."""
+    blended = np.einsum("vk,vkab->vab", skinned.weights, matrices[skinned.joints])
+    homogeneous = np.concatenate([skinned.bound, np.ones((len(skinned.bound), 1))], axis=1)
+    return np.einsum("vab,vb->va", blended[:, :3], homogeneous)

@@ -108,7 +108,7 @@ def _absolute(index: str, count: int) -> str:
 
 
 def _of_gltf(path: Path) -> list[_Part]:
-    parts = [part for part in gltf_file.parts(path) if len(part.faces)]
+    parts = [part for part in gltf_file.parts(gltf_file.Document(path)) if len(part.faces)]
     colours = [None if part.colours is None else 255.0 * part.colours for part in parts]
     return [
         _Part(part.names, part.vertices, part.faces, _is_red(own, len(part.vertices)))

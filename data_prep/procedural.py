@@ -20,7 +20,7 @@ from clothjax.files.storage import canonical_rotation, joint_names, load_rig, sa
 from clothjax.types import Motion
 from data_prep.program import run
 from data_prep.retarget import from_t_pose, stand
-from data_prep.skeleton import cmu_names
+from data_prep.skeleton import landmarks
 
 # cycles per second, before the factor of the seed
 RATES = {"walk": 0.9, "run": 1.35, "jump": 0.5, "arms": 0.35, "twist": 0.4, "dance": 0.8}
@@ -66,7 +66,7 @@ def generate(kind: str, seed: int = 0, seconds: float = 8.0, fps: float = 30.0, 
         seed: of the rate, size, phase and sway.
         seconds: duration of the clip.
         fps: frames per second.
-        body: file (or embedded), with CMU's or SMPL's joint names.
+        body: file (or embedded), whose joints have names that `skeleton` knows.
 
     Raises:
         ValueError: for an unknown kind, a clip of less than three frames, or a body without the joints.
@@ -78,7 +78,14 @@ def generate(kind: str, seed: int = 0, seconds: float = 8.0, fps: float = 30.0, 
     pattern = _pattern(kind, seed, seconds, fps)
     to_t_pose = canonical_rotation(body)
     body, names = load_rig(body)
-    local = {names[_find(names, j)]: _matrices(angles) for j, angles in pattern.angles.items()}
+    known = landmarks(names, body.parents)
+    missing = sorted(set(pattern.angles) - set(known))
+    if missing:
+        raise ValueError(f"the body has no joints {missing} (CMU's names) or the like, only {', '.join(names)}")
+    local: dict[str, np.ndarray] = {}
+    for joint, angles in pattern.angles.items():  # two of a short trunk may be one
+        name, turn = names[known[joint]], _matrices(angles)
+        local[name] = local[name] @ turn if name in local else turn
     rotations = from_t_pose(local, body, names, to_t_pose)
     motion = Motion(rotations.astype(np.float32), pattern.root - body.joints[0], fps)
     return stand(motion, body)
@@ -201,15 +208,6 @@ def _noise(beat: Beat, waves: int = 4) -> np.ndarray:
 def _matrices(degrees: np.ndarray) -> np.ndarray:
     """Convert degrees [T, 3] about x, y, z to rotations [T, 3, 3]."""
     return Rotation.from_euler("zyx", degrees[:, ::-1], degrees=True).as_matrix()
-
-
-def _find(names: tuple[str, ...], joint: str) -> int:
-    """Return the index of the joint with a CMU name."""
-    if joint not in cmu_names(names):
-        raise ValueError(
-            f"the body has no joint {joint!r} (CMU's name) or SMPL's equivalent, only {', '.join(names)}: rename it"
-        )
-    return cmu_names(names).index(joint)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
 from clothjax.types import Motion
@@ -66,22 +68,38 @@ class SkeletonOptions(MotionOptions):
     """Degrees the clavicles are lowered; 15 for CMU's recordings."""
 
 
+def known_parts(
+    names: tuple[str, ...], parents: np.ndarray, joints: Path | None, file: Path, allow: bool = False
+) -> skeleton.Parts:
+    """Find the parts of a body by the names of its joints, or by a mapping file.
+
+    Args:
+        names, parents: of the joints.
+        joints: the mapping file; None to go by the names.
+        file: that the joints are of.
+        allow: take a skeleton without arms or head.
+
+    Raises:
+        ValueError: if joints are not known; a mapping file to fill in is then written and named.
+    """
+    if joints is not None:
+        return skeleton.mapped(names, parents, joints, allow)
+    try:
+        return skeleton.find(names, parents, str(file), allow)
+    except ValueError as error:
+        draft = Path(f"{file.name.partition('.')[0]}_joints.yaml")
+        if not draft.exists():  # it may have been filled in
+            draft.write_text(skeleton.guess(names, parents))
+        raise ValueError(f"{error}; {draft} is a first guess of one") from error
+
+
 def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, recording: Path) -> Motion:
     """Retarget a recording with the options of a program.
 
     Raises:
-        ValueError: as `retarget`. If joints are not known, a mapping file to fill in is written and named.
+        ValueError: as `known_parts` and `retarget`.
     """
-    if options.joints is not None:
-        parts = skeleton.mapped(capture.names, capture.parents, options.joints, options.allow)
-    else:
-        try:
-            parts = skeleton.find(capture.names, capture.parents, str(recording), options.allow)
-        except ValueError as error:
-            draft = Path(f"{recording.name.partition('.')[0]}_joints.yaml")
-            if not draft.exists():  # it may have been filled in
-                draft.write_text(skeleton.guess(capture.names, capture.parents))
-            raise ValueError(f"{error}; {draft} is a first guess of one") from error
+    parts = known_parts(capture.names, capture.parents, options.joints, recording, options.allow)
     return retarget(
         capture,
         rig.body,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.body.plausibility import kinematics
 from data_prep.recording import Capture
-from data_prep.skeleton import SIDES, Parts
+from data_prep.skeleton import SIDES, Parts, ancestors
 
 AXES = {sign + axis: (1 - 2 * (sign == "-")) * np.eye(3)["xyz".index(axis)] for axis in "xyz" for sign in ("", "-")}
 UPRIGHT = 0.6  # least cosine between the figure, on average over the frames, and the axis that is up
@@ -175,3 +175,29 @@ def basis(along: np.ndarray, across: np.ndarray) -> np.ndarray:
     along = unit(along)
     across = unit(across - (across @ along) * along)
     return np.stack([along, across, np.cross(along, across)], axis=1)
+
+
+def to_t_pose(joints: np.ndarray, parents: np.ndarray, known: dict[str, int]) -> np.ndarray:
+    """Return rotations [J, 3, 3] to a T-pose: arms to the sides, legs down, what hangs on a hand as its forearm.
+
+    Args:
+        joints: [J, 3] m, of a body that faces +z, as it stands.
+        parents: [J].
+        known: of `skeleton.landmarks`.
+    """
+    turns = np.tile(np.eye(3), (len(joints), 1, 1))
+    for side, out in (("Left", [1.0, 0, 0]), ("Right", [-1.0, 0, 0])):
+        for bone, end, goal in (
+            ("Arm", "ForeArm", out),
+            ("ForeArm", "Hand", out),
+            ("UpLeg", "Leg", [0, -1.0, 0]),
+            ("Leg", "Foot", [0, -1.0, 0]),
+        ):
+            if side + end in known:
+                along = joints[known[side + end]] - joints[known[side + bone]]
+                turns[known[side + bone]] = Rotation.align_vectors([goal], along[None])[0].as_matrix()
+        hand = known.get(f"{side}Hand")
+        for joint in range(len(joints)) if hand is not None else ():
+            if hand in ancestors(joint, parents):
+                turns[joint] = turns[known[f"{side}ForeArm"]]
+    return turns

@@ -40,6 +40,7 @@ SIDES = ("left", "right")
 ARM, LEG = ("clavicle", "upper arm", "forearm", "hand"), ("thigh", "shin", "foot", "toe")
 SIDED = tuple(f"{side} {part}" for side in SIDES for part in (*ARM, *LEG))
 MIDDLE = ("hips", "neck", "head")
+CMU_LIMBS = dict(zip((*ARM, *LEG), ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")))
 NEEDED = ("upper arm", "forearm", "thigh", "shin", "foot")  # of either side; and hips, neck or head
 ARMS = (  # names of ARM by scheme, without side and separators
     ("shoulder", "arm", "forearm", "hand"),
@@ -80,6 +81,26 @@ def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(CMU_FROM_SMPL.get(n, n) for n in names)
 
 
+def landmarks(names: tuple[str, ...], parents: np.ndarray) -> dict[str, int]:
+    """Return the joints of a body by CMU's names, as far as they are known; one of the trunk may have several names.
+
+    Args:
+        names: of the joints.
+        parents: [J] of the joints, -1 for the root; parents come first.
+    """
+    known = {name: joint for joint, name in reversed(list(enumerate(cmu_names(names))))}
+    try:
+        parts = find(names, parents)
+    except ValueError:
+        return known
+    known |= {
+        f"{part.split()[0].capitalize()}{CMU_LIMBS[part.partition(' ')[2]]}": j for part, j in parts.limbs.items()
+    }
+    trunk, neck = parts.spine or (parts.hips,), parts.neck or (parts.chain[-1],)
+    known |= {"Hips": parts.hips, "Neck": neck[0], "Head": neck[-1]}
+    return known | {"LowerBack": trunk[0], "Spine": trunk[len(trunk) // 2], "Spine1": trunk[-1]}
+
+
 def find(names: tuple[str, ...], parents: np.ndarray, about: str = "the skeleton", allow: bool = False) -> Parts:
     """Find the parts of a body by the names of its joints.
 
@@ -107,20 +128,33 @@ def mapped(names: tuple[str, ...], parents: np.ndarray, path: Path, allow: bool 
         raise ValueError(f"{path}: not a mapping of joints ({error})") from error
     if not isinstance(rows, dict):
         raise ValueError(f"{path}: expected lines such as 'left upper arm: JOINT'")
-    rows = {str(part): str(joint) for part, joint in rows.items() if joint}
+    return told({str(part): str(joint) for part, joint in rows.items() if joint}, names, parents, str(path), allow)
+
+
+def told(rows: dict[str, str], names: tuple[str, ...], parents: np.ndarray, about: str, allow: bool = False) -> Parts:
+    """Return the parts of a body of which somebody said the joints.
+
+    Args:
+        rows: names of joints by part.
+        names, parents, allow: as of `find`.
+        about: who said it, for messages.
+
+    Raises:
+        ValueError: for what is not a part, not a joint, or missing.
+    """
     unknown = sorted(set(rows) - {*MIDDLE, *SIDED})
     absent = sorted(set(rows.values()) - set(names))
     if unknown:
-        raise ValueError(f"{path}: no parts: {', '.join(unknown)}; there are {', '.join((*MIDDLE, *SIDED))}")
+        raise ValueError(f"{about}: no parts: {', '.join(unknown)}; there are {', '.join((*MIDDLE, *SIDED))}")
     if absent:
-        raise ValueError(f"{path}: no joints of the recording: {', '.join(absent)}; it has {', '.join(names)}")
+        raise ValueError(f"{about}: no joints of the recording: {', '.join(absent)}; it has {', '.join(names)}")
     limbs = {part: names.index(rows[part]) for part in SIDED if part in rows}
     central = {("", part): names.index(rows[part]) for part in MIDDLE if part in rows}
     for part, joint in limbs.items():
         end = limbs.get(end_of(part))
         if end is not None and (end == joint or joint not in ancestors(end, parents)):
-            raise ValueError(f"{path}: {names[end]}, the {end_of(part)}, does not hang on {names[joint]}, the {part}")
-    return _whole(names, parents, limbs, central, str(path), allow)
+            raise ValueError(f"{about}: {names[end]}, the {end_of(part)}, does not hang on {names[joint]}, the {part}")
+    return _whole(names, parents, limbs, central, about, allow)
 
 
 def guess(names: tuple[str, ...], parents: np.ndarray) -> str:

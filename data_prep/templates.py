@@ -14,13 +14,12 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import ConvexHull
 
-from clothjax.config import HANDS
 from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
-from data_prep.dressing import ARM, FOREARM, WINDING, clear_vertices, dress, highest_opening, limbs, push_out
+from data_prep.dressing import WINDING, clear_vertices, dress, highest_opening, limbs, push_out
 from data_prep.mesh import clip, component
 from data_prep.remesh import flip, relax, resample
-from data_prep.skeleton import cmu_names
+from data_prep.skeleton import landmarks
 
 OFFSET = 0.012  # m, from the body to the solid
 CELL = 0.008  # m, spacing of the distance field's grid
@@ -90,7 +89,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
         template: one of TEMPLATES.
         vertices: wanted; the garment has as many within 3 %.
         body: watertight, in an A- or T-pose.
-        names: of its joints, CMU's or SMPL's.
+        names: of its joints, of a scheme that `skeleton` knows.
         seed: of the diffusion's samples.
 
     Raises:
@@ -115,7 +114,7 @@ def build(template: str, vertices: int, body: Body, names: tuple[str, ...], seed
             "on this body: try another pose, or bring a mesh (--mesh)"
         )
     long = kind.sleeve is not None and kind.sleeve > 1
-    hidden = limbs(body, names, ARM if kind.waist else HANDS if long else FOREARM)
+    hidden = limbs(body, names, "Arm" if kind.waist else "Hand" if long else "ForeArm")
     pinned = highest_opening(shape, faces) if kind.waist else np.zeros(len(shape), bool)
     return dress(shape, faces, body, hidden, pinned, kind.samples, seed)
 
@@ -134,13 +133,13 @@ def _fit(
 
 def _landmarks(body: Body, names: tuple[str, ...]) -> Landmarks:
     """Find the landmarks of a body by the names of its joints."""
-    known = cmu_names(names)
-    joint = {name: np.asarray(place, np.float64) for name, place in zip(known, body.joints)}
+    places = np.asarray(body.joints, np.float64)
+    joint = {name: places[number] for name, number in landmarks(names, body.parents).items()}
     needed = {"Neck", "Hips", "LowerBack"} | {
         side + bone for side in ("Left", "Right") for bone in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
     }
     if needed - set(joint):
-        raise ValueError(f"the body lacks the joints {sorted(needed - set(joint))}: name them as CMU or SMPL do")
+        raise ValueError(f"the body lacks the joints {sorted(needed - set(joint))}: name them as Mixamo or SMPL do")
     vertices = np.asarray(body.vertices, np.float64)
     tall = np.ptp(vertices[:, 1])
     height = {name: place[1] for name, place in joint.items()}
@@ -152,7 +151,7 @@ def _landmarks(body: Body, names: tuple[str, ...]) -> Landmarks:
         "knee": height["LeftLeg"],
         "ankle": height["LeftFoot"],
     }
-    return Landmarks(vertices, np.asarray(body.faces, np.int64), limbs(body, names, ARM), joint, level)
+    return Landmarks(vertices, np.asarray(body.faces, np.int64), limbs(body, names, "Arm"), joint, level)
 
 
 def _solid(kind: Template, marks: Landmarks) -> tuple[np.ndarray, np.ndarray]:

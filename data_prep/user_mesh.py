@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from clothjax.geometry.topology import boundary_loops, components
 from clothjax.types import Body, Garment
 from data_prep import marks, mesh_file
-from data_prep.dressing import FOREARM, WINDING, dress, limbs, push_out
+from data_prep.dressing import WINDING, dress, limbs, push_out
 from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
 from data_prep.placement import Placement, Surface, better_place, check_objects, check_place
@@ -270,7 +270,7 @@ def _uncovered_arms(points: np.ndarray, body: Body, names: tuple[str, ...]) -> n
 
     A skirt must not follow the hands beside it.
     """
-    arms = limbs(body, names, FOREARM)
+    arms = limbs(body, names, "ForeArm")
     distance, nearest = cKDTree(body.vertices).query(points)
     covered = (arms[nearest] & (distance < LOOSE_DISTANCE)).mean() > 0.01
     return arms & ~covered

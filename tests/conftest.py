@@ -39,7 +39,8 @@ def shared() -> Path:
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     """A folder with the project in it, and what the commands of the documents call a user's own."""
-    import samples  # after the settings above
+    import rigged  # after the settings above
+    import samples
 
     from clothjax.files import storage
 
@@ -53,6 +54,7 @@ def workplace(tmp_path_factory):
     (folder / "walk.bvh").write_text(samples.BVH)
     np.savez(folder / "02_01_poses.npz", **samples.recording())
     (folder / "SMPL_FEMALE.pkl").write_bytes(pickle.dumps(samples.smpl_arrays(), protocol=2))
+    rigged.another(folder / "character.glb")
     cloth = storage.load_garment("tshirt_1000", storage.load_body("body"))
     trimesh.Trimesh(100 * np.asarray(cloth.vertices), np.asarray(cloth.faces), process=False).export(
         folder / "shirt.obj"

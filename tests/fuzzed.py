@@ -26,7 +26,10 @@ def readers() -> dict:
     from clothjax.config import Config
     from clothjax.files import checkpoint, configuration, storage
     from clothjax.runtime import trained
-    from data_prep import amass, asf_amc, bvh, mesh_file, smpl
+    from data_prep import amass, asf_amc, bvh, character, gltf, mesh_file, smpl
+
+    def rigged(path: Path) -> None:
+        gltf.motions(character.read(path), 30.0)
 
     return {
         "body.h5": storage.load_body,
@@ -44,6 +47,7 @@ def readers() -> dict:
         "mesh.stl": mesh_file.read,
         "mesh.off": mesh_file.read,
         "mesh.glb": mesh_file.read,
+        "figure.glb": rigged,
         "model.npz": lambda path: trained.psi(path.parent),
         "checkpoint": lambda path: checkpoint.read(path, "params"),
     }

@@ -4,6 +4,7 @@ import shlex
 import sys
 
 import numpy as np
+import onnxruntime
 import pytest
 import trimesh
 from samples import SMALL, commands, run
@@ -73,3 +74,19 @@ def test_four_commands(name, make, parts, workplace):
     assert cloth.pinned.sum() > 10
     exported = list((workplace / "runs" / name).glob("*.onnx"))
     assert len(exported) == 1 and exported[0].stat().st_size > 1e5
+
+
+@pytest.mark.slow
+def test_five_commands_from_a_rigged_character(workplace):
+    five = [command for command in commands() if "hero" in command]
+    assert len(five) == 5
+    for command in five:
+        run(
+            [sys.executable, *shlex.split(command + (" " + SMALL if "experiments.train" in command else ""))[1:]],
+            workplace,
+        )
+    body, names = storage.load_rig(workplace / "hero.h5")
+    assert names[0] == "pelvis" and np.ptp(body.vertices[:, 1]) == pytest.approx(0.9 * 1.84, abs=0.02)
+    (exported,) = (workplace / "runs" / "hero").glob("*.onnx")
+    session = onnxruntime.InferenceSession(exported)
+    assert next(x.shape for x in session.get_outputs() if x.name == "vertices")[1] > 900

@@ -14,6 +14,7 @@ import fuzzed
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rigged
 import trimesh
 from samples import AMC, ASF, BVH, recording, smpl_arrays, spin, three_joints, two_faces
 from toy import small, untrained_psi
@@ -55,6 +56,12 @@ def seeds(tmp_path_factory):
     ball = trimesh.creation.icosphere(1)
     for name in ("mesh.obj", "mesh.ply", "mesh.stl", "mesh.off", "mesh.glb"):
         ball.export(paths[name])
+    body, names = storage.load_rig("body")
+    walk = storage.load_motion("walk_3", names)
+    walk = walk._replace(rotations=walk.rotations[:4], translation=walk.translation[:4])
+    rigged.write(
+        paths["figure.glb"], rigged.coarse(body), names, walk, morphs={"wide": rigged.coarse(body).shapedirs[..., 1]}
+    )
     _, _, _, garment, predictor, normalizers = untrained_psi(small())
     phi = {"params": {"garment": garment}, "statistics": {"nodes": normalisation.empty_statistics(3)}}
     folder = paths["model.npz"].parent

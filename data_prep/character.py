@@ -1,0 +1,362 @@
+"""The body of a rigged character in a glTF file: its skinned mesh, in the pose in which it was bound to its skeleton.
+
+A file does not say which way the character faces, its unit, or which joint is which part. All are read off the pose and
+the names. A mesh of several objects, with openings or with clothes on is wrapped in one closed surface.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import igl
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from clothjax.files.damage import UNREADABLE
+from clothjax.files.storage import Rig
+from clothjax.types import Body
+from data_prep import skeleton
+from data_prep.gltf_file import Document, Part, parts
+from data_prep.program import METRES, Unit, known_parts
+from data_prep.rest_pose import AXES, to_t_pose, unit
+from data_prep.wrap import VERTICES, carried_over, is_closed, wrap
+
+TALL = (1.0, 2.3)  # m, of a figure whose unit of length is looked for
+FARTHEST = 2.5  # m, of a vertex from the hips
+WELD = 1e-5  # m, within which vertices are one: files split them where textures and normals do
+MOST_FACES = 30_000  # of a body as it is; contact is sought on every one
+MOVED = 0.005  # m, by which a morph target moves the trunk or a limb at least to be a shape of the body
+FULL = 3.0  # betas at which a morph target is taken in full
+VRM_LIMBS = ("Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes")  # bones of VRM
+VRM = {part: part for part in skeleton.MIDDLE} | {
+    f"{side}{bone}": f"{side} {part}"
+    for side in skeleton.SIDES
+    for bone, part in zip(VRM_LIMBS, (*skeleton.ARM, *skeleton.LEG), strict=True)
+}
+
+
+class Bound(NamedTuple):
+    """A character in the pose in which it was bound to its skeleton, in the axes and the unit of its file."""
+
+    nodes: tuple[int, ...]  # of the joints, the hips first, parents before children
+    names: tuple[str, ...]
+    parents: np.ndarray  # [J]
+    places: np.ndarray  # [J, 4, 4] of the joints
+    vertices: np.ndarray  # [V, 3]
+    faces: np.ndarray  # [F, 3]
+    weights: np.ndarray  # [V, J]
+    morphs: dict[str, np.ndarray]  # [V, 3] by name
+
+
+class Upright(NamedTuple):
+    """From a file's axes and unit to metres, with y up and z forward."""
+
+    turn: np.ndarray  # [3, 3]
+    scale: float
+
+    def points(self, x: np.ndarray) -> np.ndarray:
+        """Return points [..., 3] in m."""
+        return self.scale * x @ self.turn.T
+
+    def rotations(self, x: np.ndarray) -> np.ndarray:
+        """Return rotations [..., 3, 3] between points of the file as those between points in m."""
+        return self.turn @ x @ self.turn.T
+
+
+class Character(NamedTuple):
+    """A body, and how to read the motions of its joints."""
+
+    rig: Rig
+    canonical_rotation: np.ndarray  # [J, 3, 3], as of `save_body`
+    document: Document
+    bound: Bound
+    upright: Upright
+    log: tuple[str, ...]  # what was done, and what of the file is left out
+
+
+def read(
+    path: str | Path,
+    objects: tuple[str, ...] = (),
+    shapes: tuple[str, ...] = (),
+    joints: Path | None = None,
+    units: Unit | None = None,
+) -> Character:
+    """Read the character in a file.
+
+    Args:
+        path: of a .glb, .gltf or .vrm file.
+        objects: names of the objects, meshes or materials that are its body; default: all that its skeleton moves.
+        shapes: morph targets that become shape parameters; default: those that move more than its head.
+        joints: a mapping file, as of `skeleton.mapped`.
+        units: the unit of length of the file; default: what makes it as tall as people are.
+
+    Raises:
+        ValueError: naming the file, the place in it and what to do.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: no such file")
+    with naming(path):
+        document = Document(path)
+        found = parts(document)
+        skinned = [part for part in found if part.skinned is not None and len(part.faces)]
+        if not skinned:
+            raise ValueError("no mesh is skinned: export the character with its skeleton")
+        chosen = _chosen(skinned, objects)
+        bound, of_body, log = _bound(document, chosen, joints)
+        upright, told = _upright(bound, of_body, units)
+        body, wrapped = _body(bound, upright, shapes)
+        known = skeleton.landmarks(bound.names, bound.parents)
+        canonical = to_t_pose(np.asarray(body.joints), bound.parents, known)
+    left = [part for part in found if not any(part is each for each in chosen)]
+    if left:
+        names = dict.fromkeys(part.names[0] for part in left if part.names)
+        log.append(f"left out, not of the body: {', '.join(names)}")
+    return Character(Rig(body, bound.names), canonical, document, bound, upright, (*log, *told, *wrapped))
+
+
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Raise whatever damage to a file raises as a ValueError that names it."""
+    try:
+        yield
+    except UNREADABLE as error:
+        detail = error if isinstance(error, ValueError) else f"damaged, or not glTF: {type(error).__name__} {error}"
+        prefix = "" if str(detail).startswith(str(path)) else f"{path}: "
+        raise ValueError(f"{prefix}{detail}") from error
+
+
+def _chosen(skinned: list[Part], objects: tuple[str, ...]) -> list[Part]:
+    """Return the parts that have one of some names, all if none is given."""
+    names = dict.fromkeys(name for part in skinned for name in part.names)
+    absent = [name for name in objects if name not in names]
+    if absent:
+        raise ValueError(f"no skinned object is called {', '.join(absent)}; there are {', '.join(names)}")
+    return [part for part in skinned if not objects or set(objects) & set(part.names)]
+
+
+def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple[Bound, skeleton.Parts, list[str]]:
+    """Return a character as it was bound, the parts of its body, and what was done."""
+    scene = document.places()
+    moving = {node for node in scene if any(node in skin["joints"] for skin in document.entries("skins"))}
+    carrying = {above for node in moving for above in document.above(node)}
+    nodes = [node for node in scene if node in carrying]
+    names, parents, of_body, log = _skeleton(document, nodes, joints)
+    below = [j for j in range(len(nodes)) if of_body.hips in skeleton.ancestors(j, parents)]
+    largest = max((part.skinned for part in chosen if part.skinned is not None), key=lambda it: len(it.bound))
+    places = _places(document, scene, nodes, parents, largest.skin)
+    if not np.allclose(places, np.stack([scene[node] for node in nodes]), atol=1e-3):
+        log.append(
+            "the scene shows another pose than the one it was bound in, which is taken: clothes in it do not fit"
+        )
+    number = {nodes[j]: k for k, j in enumerate(below)}
+
+    vertices, faces, weights, moves, outside = [], [], [], [], 0
+    for part in chosen:
+        assert part.skinned is not None
+        skin, count = document.entries("skins")[part.skinned.skin], len(part.vertices)
+        to_world = _to_world(document, part.skinned.skin, nodes, places)
+        columns = np.array([number.get(joint, 0) for joint in skin["joints"]])[part.skinned.joints]
+        elsewhere = np.array([joint not in number for joint in skin["joints"]])[part.skinned.joints]
+        outside += int(((part.skinned.weights * elsewhere).sum(axis=1) > 0.01).sum())
+        own = np.zeros((count, len(below)))
+        np.add.at(own, (np.arange(count)[:, None], columns), part.skinned.weights)
+        own[own.sum(axis=1) == 0, 0] = 1.0
+        faces.append(part.faces + sum(map(len, vertices)))
+        vertices.append(part.skinned.bound @ to_world[:3, :3].T + to_world[:3, 3])
+        weights.append(own)
+        moves.append({name: added @ to_world[:3, :3].T for name, added in part.morphs.items()})
+    if outside:
+        log.append(f"{outside} vertices follow joints that do not hang on the hips: they follow the hips")
+    vertices, faces, weights = (np.concatenate(each) for each in (vertices, faces, weights))
+    if faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError("a face names a vertex that is not there, or a vertex is not finite")
+    still = [np.zeros_like(part.vertices) for part in chosen]
+    bound = Bound(
+        nodes=tuple(number),
+        names=tuple(names[j] for j in below),
+        parents=np.array([below.index(parents[j]) if parents[j] in below else -1 for j in below]),
+        places=places[below],
+        vertices=vertices,
+        faces=faces,
+        weights=weights,
+        morphs={
+            name: np.concatenate([own.get(name, zero) for own, zero in zip(moves, still, strict=True)])
+            for name in dict.fromkeys(name for own in moves for name in own)
+        },
+    )
+    return bound, skeleton.find(bound.names, bound.parents), log
+
+
+def _skeleton(
+    document: Document, nodes: list[int], joints: Path | None
+) -> tuple[tuple[str, ...], np.ndarray, skeleton.Parts, list[str]]:
+    """Return names and parents [n] of nodes, the parts of the body among them, and which are called otherwise."""
+    parents = np.array([nodes.index(above) if (above := document.parent(node)) in nodes else -1 for node in nodes])
+    names = _distinct([document.entries("nodes")[node].get("name") or f"node {node}" for node in nodes])
+    humanoid = {part: names[nodes.index(node)] for part, node in _humanoid(document).items() if node in nodes}
+    if humanoid and joints is None:
+        of_body = skeleton.told(humanoid, names, parents, "its VRM humanoid")
+    else:
+        of_body = known_parts(names, parents, joints, document.path)
+    known = _known_names(names, parents, of_body)
+    log = [f"joint {old} is called {new}" for old, new in zip(names, known, strict=True) if old != new]
+    return known, parents, of_body, log
+
+
+def _distinct(names: list[str]) -> tuple[str, ...]:
+    return tuple(name if names.index(name) == k else f"{name} {k}" for k, name in enumerate(names))
+
+
+def _humanoid(document: Document) -> dict[str, int]:
+    """Return the nodes of the parts of a VRM character, of version 0 or 1; nothing for others."""
+    extensions = document.json.get("extensions", {})
+    new = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
+    old = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
+    bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
+    return {VRM[name]: node for name, node in bones.items() if name in VRM}
+
+
+def _known_names(names: tuple[str, ...], parents: np.ndarray, of_body: skeleton.Parts) -> tuple[str, ...]:
+    """Return names by which the parts of a body are found again: its own, or CMU's where they are of no scheme."""
+    try:
+        if skeleton.find(names, parents) == of_body:
+            return names
+    except ValueError:
+        pass
+    renamed = {of_body.hips: "Hips", of_body.chain[-1]: "Head"}
+    for part, joint in of_body.limbs.items():
+        side, _, own = part.partition(" ")
+        renamed[joint] = f"{side.capitalize()}{skeleton.CMU_LIMBS[own]}"
+    taken = set(renamed.values())
+    return tuple(renamed.get(j, f"{name} of the file" if name in taken else name) for j, name in enumerate(names))
+
+
+def _places(document: Document, scene: dict, nodes: list[int], parents: np.ndarray, skin: int) -> np.ndarray:
+    """Return the matrices [J, 4, 4] of the joints in the pose in which a skin was bound to them.
+
+    The scene may show another pose. Then the first joint's turn, to whole quarters, says how the mesh's axes lie.
+    """
+    inverse = document.inverse_bind(skin)
+    if inverse is None:
+        return np.stack([scene[node] for node in nodes])
+    own = dict(zip(document.entries("skins")[skin]["joints"], np.linalg.inv(inverse), strict=True))
+    first = next(node for node in nodes if node in own)
+    to_world = scene[first] @ np.linalg.inv(own[first])
+    if not all(np.allclose(scene[node], to_world @ own[node], atol=1e-3) for node in own):
+        turn = nearest_rotations(to_world[:3, :3])
+        quarters = Rotation.create_group("O").as_matrix()
+        quarter = quarters[np.argmax(np.einsum("ab,nab->n", turn, quarters))]
+        to_world[:3, :3] = quarter @ turn.T @ to_world[:3, :3]
+    places = np.zeros((len(nodes), 4, 4))
+    for j, node in enumerate(nodes):
+        if node in own:
+            places[j] = to_world @ own[node]
+        elif parents[j] >= 0:
+            above = scene[nodes[parents[j]]]
+            places[j] = places[parents[j]] @ np.linalg.inv(above) @ scene[node]
+        else:
+            places[j] = scene[node]
+    return places
+
+
+def _to_world(document: Document, skin: int, nodes: list[int], places: np.ndarray) -> np.ndarray:
+    """Return the matrix [4, 4] from the mesh of a skin to the world, in which it was bound."""
+    inverse, joints = document.inverse_bind(skin), document.entries("skins")[skin]["joints"]
+    return np.eye(4) if inverse is None else places[nodes.index(joints[0])] @ inverse[0]
+
+
+def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
+    """Return the rotations [..., 3, 3] nearest to matrices that may scale."""
+    left, _, right = np.linalg.svd(matrices)
+    return left @ right
+
+
+def _upright(bound: Bound, of_body: skeleton.Parts, units: Unit | None) -> tuple[Upright, list[str]]:
+    """Return how a character is turned and scaled, and what is to be told of it."""
+    at, limbs, told = bound.places[:, :3, 3], of_body.limbs, []
+    trunk = unit(at[of_body.chain[-1]] - at[of_body.hips])
+    name = max(AXES, key=lambda axis: float(trunk @ AXES[axis]))
+    up = AXES[name]
+    across = at[limbs["left thigh"]] - at[limbs["right thigh"]]
+    left = unit(across - (across @ up) * up)
+    if trunk @ up < 0.8 or np.linalg.norm(left) == 0.0:
+        raise ValueError("it was not bound to its skeleton standing: bind it in a T-pose or an A-pose")
+    nearest = max(AXES.values(), key=lambda axis: float(left @ axis))
+    left = nearest if left @ nearest > np.cos(np.radians(10.0)) and nearest @ up == 0 else left
+    turn = np.stack([left, up, np.cross(left, up)])
+    if not np.allclose(turn, np.eye(3)):
+        told.append(f"turned: {name} of the file is up, and it faces {np.round(turn[2], 2).tolist()}")
+    for side in skeleton.SIDES:
+        foot = limbs[f"{side} foot"]
+        share = bound.weights[:, [foot in skeleton.ancestors(j, bound.parents) for j in range(len(at))]].sum(axis=1)
+        if share.sum() > 0 and (share @ (bound.vertices - at[foot]) / share.sum()) @ turn[2] < 0:
+            raise ValueError(
+                f"its {side} foot points backwards: it is mirrored, or the names of left and right are exchanged"
+            )
+    tall = np.ptp(bound.vertices @ up)
+    scale = METRES[units] if units else next((x for x in METRES.values() if TALL[0] < x * tall < TALL[1]), 0.0)
+    scale = 1.0 if not units and 0.3 < tall < 3.0 else scale
+    if not 0.3 < scale * tall < 3.0:
+        raise ValueError(f"it is {tall:.4g} units tall, 0.3 to 3 m is expected: give its unit (--units)")
+    reach = np.linalg.norm(bound.vertices - at[of_body.hips], axis=1)
+    if scale * reach.max() > FARTHEST:
+        raise ValueError(
+            f"a vertex at {np.round(bound.vertices[reach.argmax()], 2).tolist()} is {scale * reach.max():.1f} m from "
+            "the hips: leave out what is not the body (--object)"
+        )
+    told.append(f"{scale * tall:.2f} m tall" + ("" if scale == 1.0 else f": a unit of the file is {1000 * scale:g} mm"))
+    return Upright(turn, scale), told
+
+
+def _body(bound: Bound, upright: Upright, shapes: tuple[str, ...]) -> tuple[Body, list[str]]:
+    """Return a character's body in m, wrapped if it is not one closed surface, and what was done."""
+    vertices, joints = upright.points(bound.vertices), upright.points(bound.places[:, :3, 3])
+    _, first, index = np.unique(np.round(vertices / WELD), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # as they are in the file
+    first, faces = first[order], np.argsort(order)[index.reshape(-1)][bound.faces]
+    used, faces = np.unique(faces[(faces != faces[:, [1, 2, 0]]).all(axis=1)], return_inverse=True)
+    first, faces = first[used], faces.reshape(-1, 3)
+    weights, vertices = bound.weights[first], vertices[first]
+    chosen = _shapes(bound, upright, shapes)
+    directions = np.stack([added[first] for added in chosen.values()] or [np.zeros((len(vertices), 0))], axis=-1)
+    directions = directions.reshape(len(vertices), 3, -1) / FULL
+    log = [f"shape parameters, {FULL:g} for the whole of it: {', '.join(chosen)}"] if chosen else []
+    closed = is_closed(vertices, faces)
+    if not closed or len(faces) > MOST_FACES:
+        surface, triangles = wrap(vertices, faces, VERTICES)
+        distance = np.sqrt(igl.point_mesh_squared_distance(vertices, surface, triangles)[0])
+        reason = f"it has {len(faces)} faces" if closed else "it is not one closed surface"
+        log.append(
+            f"wrapped in a closed surface of {len(surface)} vertices, as {reason}; its vertices are "
+            f"{1000 * np.median(distance):.0f} mm from it (median), at most {1000 * distance.max():.0f} mm"
+        )
+        weights, directions = (carried_over(surface, vertices, faces, x) for x in (weights, directions))
+        vertices, faces = surface, triangles
+    weights = np.where(weights > 1e-3, weights, 0.0)
+    body = Body(
+        vertices=vertices.astype(np.float32),
+        faces=faces.astype(np.int32),
+        joints=joints.astype(np.float32),
+        parents=bound.parents.astype(np.int32),
+        weights=(weights / weights.sum(axis=1, keepdims=True)).astype(np.float32),
+        shapedirs=directions.astype(np.float32),
+        joint_shapedirs=np.zeros((len(joints), 3, directions.shape[-1]), np.float32),
+    )
+    return body, log
+
+
+def _shapes(bound: Bound, upright: Upright, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Return the morph targets [V, 3] in m that become shape parameters, by name."""
+    absent = [name for name in wanted if name not in bound.morphs]
+    if absent:
+        raise ValueError(
+            f"no morph target is called {', '.join(absent)}; there are {', '.join(bound.morphs) or 'none'}"
+        )
+    moves = {name: upright.points(added) for name, added in bound.morphs.items()}
+    if wanted:
+        return {name: moves[name] for name in wanted}
+    neck = skeleton.landmarks(bound.names, bound.parents)["Neck"]
+    of_head = [neck in skeleton.ancestors(joint, bound.parents) for joint in range(len(bound.names))]
+    elsewhere = bound.weights[:, of_head].sum(axis=1) < 0.5
+    return {name: x for name, x in moves.items() if np.linalg.norm(x[elsewhere], axis=1).max(initial=0.0) > MOVED}

@@ -1,0 +1,229 @@
+"""A rigged character in a glTF file becomes a body, and its animations motions, whatever program it is from."""
+
+import re
+
+import igl
+import numpy as np
+import pytest
+import rigged
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from clothjax.body.plausibility import joint_positions
+from clothjax.files import storage
+from data_prep import character, gltf, gltf_file, procedural, skeleton, templates, wrap
+
+QUARTER = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+HALF = np.diag([-1.0, 1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return storage.load_rig("body")
+
+
+@pytest.fixture(scope="module")
+def walk(rig):
+    clip = storage.load_motion("walk_3", rig.names)
+    return clip._replace(rotations=clip.rotations[:40], translation=clip.translation[:40])
+
+
+@pytest.fixture(scope="module")
+def axes(rig):
+    return Rotation.random(len(rig.names), rng=np.random.default_rng(0)).as_matrix()
+
+
+def dialect(name, rig, axes):
+    """Return the names of the joints and what else is written."""
+    numbered = tuple(f"Bone.{j:03}" for j in range(len(rig.names)))
+    bones = [{"bone": bone, "node": rig.names.index(joint)} for joint, bone in rigged.VRM.items()]
+    new = {bone["bone"]: {"node": bone["node"]} for bone in bones}
+    return {
+        "ours": (rig.names, {}),
+        "mixamo": (
+            tuple(f"mixamorig:{rigged.MIXAMO.get(joint, joint)}" for joint in rig.names),
+            {"axes": axes, "armature": (np.eye(3), 0.01)},
+        ),
+        "unreal": (
+            tuple(rigged.UNREAL.get(joint, joint) for joint in rig.names),
+            {"axes": axes, "unit": 0.01, "armature": (QUARTER, 1.0)},
+        ),
+        "vrm 0": (
+            numbered,
+            {"turn": HALF, "extensions": {"VRM": {"humanoid": {"humanBones": bones}}}},
+        ),
+        "vrm 1": (numbered, {"axes": axes, "extensions": {"VRMC_vrm": {"humanoid": {"humanBones": new}}}}),
+        "z up": (rig.names, {"turn": QUARTER.T, "axes": axes}),
+        "posed": (rig.names, {"axes": axes, "shown": 30, "unit": 0.01, "armature": (QUARTER, 0.1)}),
+    }[name]
+
+
+@pytest.mark.parametrize("name", ["ours", "mixamo", "unreal", "vrm 0", "vrm 1", "z up", "posed"])
+def test_a_character_is_the_body_and_the_motion_that_it_was_made_of(name, rig, walk, axes, tmp_path):
+    names, options = dialect(name, rig, axes)
+    rigged.write(tmp_path / "c.glb", rig.body, names, walk, **options)
+    found = character.read(tmp_path / "c.glb")
+    body, order = found.rig.body, [found.bound.names.index(each) for each in renamed(name, names, rig)]
+    placed = np.asarray(body.joints[0]) - np.asarray(rig.body.joints[0])  # a scene in another pose says it alone
+    assert np.abs(placed).max() < (1e-5 if name != "posed" else 2.0)
+    body = body._replace(vertices=body.vertices - placed, joints=body.joints - placed)
+    np.testing.assert_allclose(body.vertices, rig.body.vertices, atol=2e-5)
+    np.testing.assert_array_equal(body.faces, rig.body.faces)
+    np.testing.assert_allclose(body.joints[order], rig.body.joints, atol=2e-5)
+    np.testing.assert_allclose(body.weights[:, order], rig.body.weights, atol=2e-3)
+    clips, _ = gltf.motions(found, walk.fps)
+    places, expected = joint_positions(clips["a_walk"], body)[:, order], joint_positions(walk, rig.body)
+    np.testing.assert_allclose(places - places[:1, :1], expected - expected[:1, :1], atol=1e-4)
+    assert skeleton.landmarks(found.rig.names, body.parents)["LeftForeArm"] == order[rig.names.index("LeftForeArm")]
+    assert len(found.log) >= 1 and ("turned" in " ".join(found.log)) == (name in ("vrm 0", "z up"))
+
+
+def renamed(name, names, rig):
+    """Names as the body has them: joints of no scheme, if they are parts of a body, are called as CMU's."""
+    known = set(rigged.VRM) - {"Neck"} if name.startswith("vrm") else set()
+    return [joint if joint in known else own for own, joint in zip(names, rig.names)]
+
+
+def written(tmp_path, body, names, walk, **options):
+    mixamo = tuple(f"mixamorig:{rigged.MIXAMO.get(joint, joint)}" for joint in names)
+    rigged.write(tmp_path / "c.glb", body, options.pop("joints", mixamo), walk, **options)
+    return tmp_path / "c.glb"
+
+
+def heights(rig, name):
+    """The height of a joint, and those of the middles of the body's faces."""
+    middles = np.asarray(rig.body.vertices)[rig.body.faces].mean(axis=1)
+    return rig.body.joints[rig.names.index(name), 1], middles[:, 1]
+
+
+def test_objects_that_meet_are_one_body_and_others_are_wrapped(rig, walk, tmp_path):
+    faces, (neck, height) = np.asarray(rig.body.faces), heights(rig, "Neck")
+    pieces = {"Head": faces[height > neck], "Body": faces[height <= neck]}
+    whole = character.read(written(tmp_path, rig.body, rig.names, walk, objects=pieces))
+    assert whole.rig.body.faces.shape == faces.shape and "wrapped" not in " ".join(whole.log)
+    legs = height < heights(rig, "LeftLeg")[0]
+    found = character.read(written(tmp_path, rig.body, rig.names, walk, objects={"Body": faces[~legs]}))
+    body, points = found.rig.body, np.float64(rig.body.vertices)[np.unique(faces[~legs])]
+    assert "wrapped" in " ".join(found.log) and "not one closed surface" in " ".join(found.log)
+    assert wrap.is_closed(np.float64(body.vertices), np.int64(body.faces))
+    distance = np.sqrt(igl.point_mesh_squared_distance(points, np.float64(body.vertices), np.int64(body.faces))[0])
+    assert np.median(distance) < 0.004
+    np.testing.assert_allclose(body.weights.sum(axis=1), 1.0, atol=1e-5)
+    nearest = KDTree(points).query(body.vertices)[1]
+    weights = np.asarray(rig.body.weights)[np.unique(faces[~legs])][nearest]
+    assert np.abs(weights - body.weights).max(axis=1).mean() < 0.05
+
+
+def test_clothes_in_the_file_are_left_out_by_object(rig, walk, tmp_path):
+    body, faces = rig.body, np.asarray(rig.body.faces)
+    outer = np.float64(body.vertices) + 0.01 * igl.per_vertex_normals(np.float64(body.vertices), np.int64(faces))
+    both = body._replace(
+        vertices=np.concatenate([body.vertices, outer]), weights=np.concatenate([body.weights, body.weights])
+    )
+    (waist, height), neck = heights(rig, "LowerBack"), heights(rig, "Neck")[0]
+    shirt = faces[(height > waist) & (height < neck)] + len(outer)
+    path = written(tmp_path, both, rig.names, walk, objects={"Skin": faces, "Shirt": shirt})
+    alone = character.read(path, objects=("Skin",))
+    assert alone.rig.body.vertices.shape == body.vertices.shape
+    assert any("left out, not of the body: Shirt" in line for line in alone.log)
+    assert "wrapped" in " ".join(character.read(path).log)
+    with pytest.raises(ValueError, match="no skinned object is called Sknn; there are Skin, Shirt"):
+        character.read(path, objects=("Sknn",))
+
+
+def test_morph_targets_that_move_more_than_the_head_are_shapes(rig, walk, tmp_path):
+    body, wide = rig.body, np.asarray(rig.body.shapedirs)[..., 1]
+    of_head = np.asarray(body.weights)[:, rig.names.index("Head")] > 0.9
+    morphs = {"wide": 3 * wide, "smile": 0.02 * of_head[:, None] * np.ones(3)}
+    path = written(tmp_path, body, rig.names, walk, morphs=morphs, turn=HALF, armature=(np.eye(3), 0.01))
+    shaped = character.read(path).rig.body
+    np.testing.assert_allclose(shaped.shapedirs[..., 0], wide, atol=1e-5)
+    assert (
+        shaped.shapedirs.shape[-1] == 1
+        and character.read(path, shapes=("smile", "wide")).rig.body.shapedirs.shape[-1] == 2
+    )
+    with pytest.raises(ValueError, match=r"c\.glb: no morph target is called wide2; there are wide, smile"):
+        character.read(path, shapes=("wide2",))
+
+
+def exchanged(names):
+    """Names with left and right exchanged."""
+    return tuple(re.sub("^(Left|Right)", lambda m: {"Left": "Right", "Right": "Left"}[m[0]], n) for n in names)
+
+
+def test_what_is_no_character_is_refused_with_what_to_do(rig, walk, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"c\.glb: its left foot points backwards: it is mirrored, or the names"):
+        character.read(written(tmp_path, rig.body, rig.names, walk, joints=exchanged(rig.names)))
+    with pytest.raises(ValueError, match=r"c\.glb: it was not bound to its skeleton standing: bind it in a T-pose"):
+        slope = Rotation.from_euler("x", -45, degrees=True).as_matrix()
+        character.read(written(tmp_path, rig.body, rig.names, walk, turn=slope))
+    with pytest.raises(ValueError, match=r"c\.glb: .*18\.\d+ units tall, 0\.3 to 3 m is expected: give its unit"):
+        character.read(written(tmp_path, rig.body, rig.names, walk, unit=0.1))
+    numbered = tuple(f"Bone.{j:03}" for j in range(len(rig.names)))
+    path = written(tmp_path, rig.body, rig.names, walk, joints=numbered)
+    with pytest.raises(ValueError, match=r"c\.glb: no joint is known as .*c_joints\.yaml is a first guess of one"):
+        character.read(path)
+    known = skeleton.landmarks(rig.names, rig.body.parents)
+    cmu = {part: f"{part.split()[0].title()}{skeleton.CMU_LIMBS[part.partition(' ')[2]]}" for part in skeleton.SIDED}
+    rows = {part: numbered[known[name]] for part, name in cmu.items()}
+    rows |= {"head": numbered[known["Head"]], "hips": numbered[known["Hips"]]}
+    (tmp_path / "map.yaml").write_text("\n".join(f"{part}: {joint}" for part, joint in rows.items()))
+    found = character.read(path, joints=tmp_path / "map.yaml")
+    assert found.rig.names[known["LeftArm"]] == "LeftArm"
+    assert any(f"joint {numbered[known['LeftArm']]} is called LeftArm" in line for line in found.log)
+    trimesh.creation.icosphere().export(tmp_path / "ball.glb")
+    with pytest.raises(ValueError, match=r"ball\.glb: no mesh is skinned: export the character with its skeleton"):
+        character.read(tmp_path / "ball.glb")
+    far = rig.body._replace(vertices=np.array(rig.body.vertices))
+    far.vertices[7, 0] = 9.0
+    with pytest.raises(ValueError, match=r"c\.glb: a vertex at .*9\.0.* is \d\.\d m from the hips: leave out"):
+        character.read(written(tmp_path, far, rig.names, walk))
+    with pytest.raises(ValueError, match=r"none\.glb: no such file"):
+        character.read(tmp_path / "none.glb")
+
+
+def test_bones_that_an_animation_stretches_are_told(rig, walk, tmp_path):
+    body = rig.body
+    longer = body._replace(joints=np.asarray(body.joints) * np.array([1.0, 1.1, 1.0]))
+    path = written(tmp_path, body, rig.names, walk)
+    found = character.read(path)
+    moved = found._replace(rig=found.rig._replace(body=longer))
+    assert any("bones keep their lengths" in line for line in gltf.motions(moved, 30.0)[1])
+    assert gltf.motions(found, 30.0)[1] == []
+
+
+def test_garments_and_motions_are_made_for_a_character_of_other_names(rig, walk, tmp_path):
+    """The command line, on a character of Unreal's names: its body, a template, a generated motion."""
+    names = tuple(rigged.UNREAL.get(joint, joint) for joint in rig.names)
+    path = written(tmp_path, rig.body, rig.names, walk, joints=names)
+    gltf.main(gltf.Arguments(path, tmp_path / "body.h5", motions=tmp_path / "motions"))
+    body, found = storage.load_rig(tmp_path / "body.h5")
+    order = [found.index(name) for name in names]
+    clip = storage.load_motion(tmp_path / "motions" / "a_walk.h5", found)
+    turns = Rotation.from_matrix(clip.rotations[:, order].reshape(-1, 3, 3)).inv() * Rotation.from_matrix(
+        np.asarray(walk.rotations).reshape(-1, 3, 3)
+    )
+    assert np.degrees(turns.magnitude()).max() < 0.1
+    ours, theirs = (procedural.generate("walk", 3, 2.0, body=each) for each in ("body", tmp_path / "body.h5"))
+    np.testing.assert_allclose(theirs.rotations[:, order], ours.rotations, atol=1e-4)
+    made = templates.build("skirt", 300, body, found)
+    expected = templates.build("skirt", 300, rig.body, rig.names)
+    assert abs(len(made.vertices) - len(expected.vertices)) < 5
+    surface = np.float64(made.vertices), np.int64(made.faces)
+    apart = np.sqrt(igl.point_mesh_squared_distance(np.float64(expected.vertices), *surface)[0])
+    assert apart.mean() < 0.002 and np.percentile(apart, 95) < 0.01  # rounding turns an edge here or there
+
+
+@pytest.mark.parametrize("how", ["STEP", "LINEAR", "CUBICSPLINE"])
+def test_keys_are_interpolated_as_the_standard_says(how):
+    keys, values = np.array([0.0, 1.0, 3.0]), np.array([[0.0], [2.0], [0.0]])
+    times = np.array([-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 4.0])
+    if how == "CUBICSPLINE":  # x^2 (3 - x) on [0, 1], with slopes 0, 3 and 0
+        spline = np.array([[0], [0], [0], [3], [2], [0], [0], [0], [0]], float)
+        found = gltf_file._sampled(times, keys, spline, how)[:, 0]
+        np.testing.assert_allclose(found, [0, 0, 0.625, 2, 1, 0, 0])
+    else:
+        expected = {"STEP": [0, 0, 0, 2, 2, 0, 0], "LINEAR": [0, 0, 1, 2, 1, 0, 0]}[how]
+        np.testing.assert_allclose(gltf_file._sampled(times, keys, values, how)[:, 0], expected)
