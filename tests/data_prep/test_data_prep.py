@@ -510,8 +510,8 @@ def test_garment_from_a_mesh(tmp_path, body):
 def test_template_refuses(body, names):
     with pytest.raises(ValueError, match="tshirt"):
         templates.build("cape", 100, body, names)
-    with pytest.raises(ValueError, match="LowerBack"):
-        templates.build("skirt", 100, body, tuple(n.replace("LowerBack", "b1") for n in names))
+    with pytest.raises(ValueError, match=r"lacks the joints \['LeftFoot', 'RightFoot'\]"):
+        templates.build("skirt", 100, body, tuple(n.replace("Foot", "b1") for n in names))
 
 
 # The body
