@@ -142,7 +142,15 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
     carrying = {above for node in moving for above in document.above(node)}
     nodes = [node for node in scene if node in carrying]
     names, parents, of_body, log = _skeleton(document, nodes, joints)
-    below = [j for j in range(len(nodes)) if of_body.hips in skeleton.ancestors(j, parents)]
+    pulling = {*of_body.chain, *of_body.limbs.values()}
+    for part in chosen:
+        assert part.skinned is not None
+        skin = document.entries("skins")[part.skinned.skin]["joints"]
+        pulling |= {nodes.index(skin[k]) for k in np.unique(part.skinned.joints[part.skinned.weights > 0])}
+    needed = {above for joint in pulling for above in skeleton.ancestors(joint, parents)}
+    below = [j for j in sorted(needed) if of_body.hips in skeleton.ancestors(j, parents)]
+    if len(nodes) > len(needed):
+        log.append(f"{len(nodes) - len(needed)} joints that move nothing are left out")
     largest = max((part.skinned for part in chosen if part.skinned is not None), key=lambda it: len(it.bound))
     places = _places(document, scene, nodes, parents, largest.skin)
     if not np.allclose(places, np.stack([scene[node] for node in nodes]), atol=1e-3):

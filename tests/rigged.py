@@ -83,6 +83,7 @@ def write(
     morphs: dict[str, np.ndarray] | None = None,
     extensions: dict | None = None,
     shown: int | None = None,
+    ends: bool = False,
 ) -> None:
     """Write a character with one animation.
 
@@ -95,6 +96,7 @@ def write(
         objects: faces [F, 3] of each object; default: one.
         morphs: [V, 3] m by name.
         extensions: of the document; for VRM.
+        ends: whether a far joint that moves nothing hangs on every last one, as importers of FBX leave them.
         shown: frame of the motion in whose pose the scene stands; default: the canonical one.
     """
     count, turn = len(names), np.eye(3) if turn is None else turn
@@ -124,10 +126,16 @@ def write(
     for j, parent in enumerate(body.parents):
         if parent >= 0:
             nodes[parent].setdefault("children", []).append(j)
+    skin, inverse = list(range(count)), np.linalg.inv(bind) @ to_world
+    for j in sorted(set(range(count)) - set(body.parents)) if ends else ():
+        nodes[j]["children"] = [len(nodes)]
+        skin.append(len(nodes))
+        inverse = np.concatenate([inverse, inverse[j : j + 1]])
+        nodes.append({"name": f"{names[j]}_end", "translation": [0.0, 700.0, 0.0]})
+    carrying = len(nodes)
     nodes.append({"name": "Armature", "matrix": carrier.T.reshape(-1).tolist(), "children": [0]})
     weights = np.sort(np.asarray(body.weights), axis=1)[:, :-5:-1]
     joints = np.argsort(np.asarray(body.weights), axis=1)[:, :-5:-1]
-    inverse = np.linalg.inv(bind) @ to_world
     attributes = {
         "POSITION": writer.add(100 * np.asarray(body.vertices)),
         "JOINTS_0": writer.add(joints, UINT16),
@@ -149,10 +157,10 @@ def write(
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,
-        "scenes": [{"nodes": list(range(count, len(nodes)))}],
+        "scenes": [{"nodes": list(range(carrying, len(nodes)))}],
         "nodes": nodes,
         "meshes": meshes,
-        "skins": [{"joints": list(range(count)), "inverseBindMatrices": writer.add(inverse.swapaxes(1, 2))}],
+        "skins": [{"joints": skin, "inverseBindMatrices": writer.add(inverse.swapaxes(1, 2))}],
         "animations": [
             {
                 "name": "a walk",

@@ -47,7 +47,7 @@ def dialect(name, rig, axes):
         ),
         "unreal": (
             tuple(rigged.UNREAL.get(joint, joint) for joint in rig.names),
-            {"axes": axes, "unit": 0.01, "armature": (QUARTER, 1.0)},
+            {"axes": axes, "unit": 0.01, "armature": (QUARTER, 1.0), "ends": True},
         ),
         "vrm 0": (
             numbered,
