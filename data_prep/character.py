@@ -138,7 +138,8 @@ def _chosen(skinned: list[Part], objects: tuple[str, ...]) -> list[Part]:
 def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple[Bound, skeleton.Parts, list[str]]:
     """Return a character as it was bound, the parts of its body, and what was done."""
     scene = document.places()
-    moving = {node for node in scene if any(node in skin["joints"] for skin in document.entries("skins"))}
+    skins = {part.skinned.skin for part in chosen if part.skinned is not None}
+    moving = {joint for skin in skins for joint in document.entries("skins")[skin]["joints"]}
     carrying = {above for node in moving for above in document.above(node)}
     nodes = [node for node in scene if node in carrying]
     names, parents, of_body, log = _skeleton(document, nodes, joints)

@@ -1,4 +1,4 @@
-"""One closed surface around a body of several objects, with openings, or with clothes on: what contact needs."""
+"""A closed surface around a body of several objects, with openings, or with clothes on: what contact needs."""
 
 import igl
 import numpy as np
@@ -6,22 +6,28 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from data_prep.dressing import WINDING
-from data_prep.mesh import component, components
+from data_prep.mesh import compact, components
 
 CELL = 0.008  # m, of the grid on which a surface is found
 BLOCK = 4  # cells, on whose middle it is looked for first
+SMALLEST = 1e-5  # m^3, of a piece
 VERTICES = 7000  # of a surface that is wrapped, as many as the embedded body has
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
     """Return whether a mesh is one closed surface, whose faces have their outside outside."""
+    return _watertight(vertices, faces) and components(len(vertices), faces).max() == 0
+
+
+def _watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    whole = mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
-    return bool(whole and components(len(vertices), faces).max() == 0)
+    return bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0)
 
 
 def wrap(vertices: np.ndarray, faces: np.ndarray, count: int = VERTICES) -> tuple[np.ndarray, np.ndarray]:
-    """Return a closed surface of about `count` vertices around whatever triangles wind around (Barill et al. 2018).
+    """Return closed surfaces of about `count` vertices around whatever triangles wind around (Barill et al. 2018).
+
+    What is smaller than SMALLEST is left out, as are hollows.
 
     Args:
         vertices: [V, 3] m.
@@ -42,13 +48,16 @@ def wrap(vertices: np.ndarray, faces: np.ndarray, count: int = VERTICES) -> tupl
     values = np.ascontiguousarray(gaussian_filter(field, 0.6).transpose(2, 1, 0)).reshape(-1)  # x runs fastest for igl
     corners = np.ascontiguousarray(places.transpose(2, 1, 0, 3)).reshape(-1, 3)
     surface, triangles = igl.marching_cubes(values, corners, *field.shape, 0.0)[:2]
-    surface, triangles = component(surface, triangles)
     if trimesh.Trimesh(surface, triangles, process=False).volume < 0:
         triangles = triangles[:, ::-1]
+    a, b, c = surface[triangles].swapaxes(0, 1)
+    label = components(len(surface), triangles)[triangles[:, 0]]
+    volume = np.bincount(label, np.sum(a * np.cross(b, c), axis=-1) / 6)
+    surface, triangles = compact(surface, triangles[volume[label] > SMALLEST])
     surface, triangles = surface.astype(np.float32), triangles.astype(np.int32)
     for aggressiveness in (5, 3, 1):  # simplifying sometimes leaves an edge with four faces
         coarse, corners = fast_simplification.simplify(surface, triangles, target_count=2 * count, agg=aggressiveness)
-        if is_closed(coarse, corners):
+        if _watertight(coarse, corners):
             return coarse.astype(np.float64), corners.astype(np.int64)
     return surface.astype(np.float64), triangles.astype(np.int64)
 

@@ -110,6 +110,9 @@ def test_objects_that_meet_are_one_body_and_others_are_wrapped(rig, walk, tmp_pa
     distance = np.sqrt(igl.point_mesh_squared_distance(points, np.float64(body.vertices), np.int64(body.faces))[0])
     assert np.median(distance) < 0.004
     np.testing.assert_allclose(body.weights.sum(axis=1), 1.0, atol=1e-5)
+    without = faces[(height > neck + 0.02) | (height < neck - 0.02)]
+    pieces = character.read(written(tmp_path, rig.body, rig.names, walk, objects={"Body": without})).rig.body
+    assert pieces.vertices[:, 1].max() == pytest.approx(rig.body.vertices[:, 1].max(), abs=0.01)
     nearest = KDTree(points).query(body.vertices)[1]
     weights = np.asarray(rig.body.weights)[np.unique(faces[~legs])][nearest]
     assert np.abs(weights - body.weights).max(axis=1).mean() < 0.05
