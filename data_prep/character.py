@@ -153,7 +153,7 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
     if len(nodes) > len(needed):
         log.append(f"{len(nodes) - len(needed)} joints that move nothing are left out")
     largest = max((part.skinned for part in chosen if part.skinned is not None), key=lambda it: len(it.bound))
-    places = _places(document, scene, nodes, parents, largest.skin)
+    places = bind_places(document, scene, nodes, parents, largest.skin)
     if not np.allclose(places, np.stack([scene[node] for node in nodes]), atol=1e-3):
         log.append(
             "the scene shows another pose than the one it was bound in, which is taken: clothes in it do not fit"
@@ -202,10 +202,10 @@ def _skeleton(
 ) -> tuple[tuple[str, ...], np.ndarray, skeleton.Parts, list[str]]:
     """Return names and parents [n] of nodes, the parts of the body among them, and which are called otherwise."""
     parents = np.array([nodes.index(above) if (above := document.parent(node)) in nodes else -1 for node in nodes])
-    names = _distinct([document.entries("nodes")[node].get("name") or f"node {node}" for node in nodes])
-    humanoid = {part: names[nodes.index(node)] for part, node in _humanoid(document).items() if node in nodes}
-    if humanoid and joints is None:
-        of_body = skeleton.told(humanoid, names, parents, "its VRM humanoid")
+    names = distinct_names([document.entries("nodes")[node].get("name") or f"node {node}" for node in nodes])
+    said = {part: names[nodes.index(node)] for part, node in humanoid(document).items() if node in nodes}
+    if said and joints is None:
+        of_body = skeleton.told(said, names, parents, "its VRM humanoid")
     else:
         of_body = known_parts(names, parents, joints, document.path)
     known = _known_names(names, parents, of_body)
@@ -213,14 +213,15 @@ def _skeleton(
     return known, parents, of_body, log
 
 
-def _distinct(names: list[str]) -> tuple[str, ...]:
+def distinct_names(names: list[str]) -> tuple[str, ...]:
+    """Return names of which no two are the same."""
     return tuple(name if names.index(name) == k else f"{name} {k}" for k, name in enumerate(names))
 
 
-def _humanoid(document: Document) -> dict[str, int]:
-    """Return the nodes of the parts of a VRM character, of version 0 or 1; nothing for others."""
+def humanoid(document: Document) -> dict[str, int]:
+    """Return the nodes of the parts of a VRM character of version 0 or 1, or of a VRM animation; nothing for others."""
     extensions = document.json.get("extensions", {})
-    new = extensions.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
+    new = extensions.get("VRMC_vrm", extensions.get("VRMC_vrm_animation", {})).get("humanoid", {}).get("humanBones", {})
     old = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
     return {VRM[name]: node for name, node in bones.items() if name in VRM}
@@ -234,14 +235,12 @@ def _known_names(names: tuple[str, ...], parents: np.ndarray, of_body: skeleton.
     except ValueError:
         pass
     renamed = {of_body.hips: "Hips", of_body.chain[-1]: "Head"}
-    for part, joint in of_body.limbs.items():
-        side, _, own = part.partition(" ")
-        renamed[joint] = f"{side.capitalize()}{skeleton.CMU_LIMBS[own]}"
+    renamed |= {joint: skeleton.cmu_name(part) for part, joint in of_body.limbs.items()}
     taken = set(renamed.values())
     return tuple(renamed.get(j, f"{name} of the file" if name in taken else name) for j, name in enumerate(names))
 
 
-def _places(document: Document, scene: dict, nodes: list[int], parents: np.ndarray, skin: int) -> np.ndarray:
+def bind_places(document: Document, scene: dict, nodes: list[int], parents: np.ndarray, skin: int) -> np.ndarray:
     """Return the matrices [J, 4, 4] of the joints in the pose in which a skin was bound to them.
 
     The scene may show another pose. Then the first joint's turn, to whole quarters, says how the mesh's axes lie.

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-SUFFIXES = (".glb", ".gltf", ".vrm")
+SUFFIXES = (".glb", ".gltf", ".vrm", ".vrma")
 READ = ("KHR_mesh_quantization", "KHR_texture", "KHR_lights", "KHR_materials", "EXT_texture", "VRM")  # beginnings
 GLB = b"glTF"
 TRIANGLES = 4  # the mode of a primitive; strips and fans follow

@@ -81,6 +81,12 @@ def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(CMU_FROM_SMPL.get(n, n) for n in names)
 
 
+def cmu_name(part: str) -> str:
+    """Return CMU's name of the joint of a part, such as `LeftForeArm` of `left forearm`."""
+    side, _, own = part.partition(" ")
+    return side.capitalize() + CMU_LIMBS.get(own, "")
+
+
 def landmarks(names: tuple[str, ...], parents: np.ndarray) -> dict[str, int]:
     """Return the joints of a body by CMU's names, as far as they are known; one of the trunk may have several names.
 
@@ -93,9 +99,7 @@ def landmarks(names: tuple[str, ...], parents: np.ndarray) -> dict[str, int]:
         parts = find(names, parents)
     except ValueError:
         return known
-    known |= {
-        f"{part.split()[0].capitalize()}{CMU_LIMBS[part.partition(' ')[2]]}": j for part, j in parts.limbs.items()
-    }
+    known |= {cmu_name(part): joint for part, joint in parts.limbs.items()}
     trunk, neck = parts.spine or (parts.hips,), parts.neck or (parts.chain[-1],)
     known |= {"Hips": parts.hips, "Neck": neck[0], "Head": neck[-1]}
     return known | {"LowerBack": trunk[0], "Spine": trunk[len(trunk) // 2], "Spine1": trunk[-1]}

@@ -26,10 +26,11 @@ def readers() -> dict:
     from clothjax.config import Config
     from clothjax.files import checkpoint, configuration, storage
     from clothjax.runtime import trained
-    from data_prep import amass, asf_amc, bvh, character, gltf, mesh_file, smpl
+    from data_prep import amass, asf_amc, bvh, character, gltf, gltf_motion, mesh_file, smpl
 
     def rigged(path: Path) -> None:
         gltf.motions(character.read(path), 30.0)
+        gltf_motion.read_gltf(path, 30.0)
 
     return {
         "body.h5": storage.load_body,

@@ -84,6 +84,7 @@ def write(
     extensions: dict | None = None,
     shown: int | None = None,
     ends: bool = False,
+    skinned: bool = True,
 ) -> None:
     """Write a character with one animation.
 
@@ -97,6 +98,7 @@ def write(
         morphs: [V, 3] m by name.
         extensions: of the document; for VRM.
         ends: whether a far joint that moves nothing hangs on every last one, as importers of FBX leave them.
+        skinned: False for an animation alone.
         shown: frame of the motion in whose pose the scene stands; default: the canonical one.
     """
     count, turn = len(names), np.eye(3) if turn is None else turn
@@ -143,7 +145,7 @@ def write(
     }
     targets = [{"POSITION": writer.add(100 * added)} for added in (morphs or {}).values()]
     meshes = []
-    for name, faces in (objects or {"Body": np.asarray(body.faces)}).items():
+    for name, faces in (objects or {"Body": np.asarray(body.faces)}).items() if skinned else ():
         primitive = {"attributes": attributes, "indices": writer.add(faces.reshape(-1), UINT32), "targets": targets}
         meshes.append({"name": name, "primitives": [primitive], "extras": {"targetNames": list(morphs or {})}})
         nodes.append({"name": name, "mesh": len(meshes) - 1, "skin": 0})
@@ -159,8 +161,8 @@ def write(
         "scene": 0,
         "scenes": [{"nodes": list(range(carrying, len(nodes)))}],
         "nodes": nodes,
-        "meshes": meshes,
-        "skins": [{"joints": skin, "inverseBindMatrices": writer.add(inverse.swapaxes(1, 2))}],
+        "meshes": meshes if skinned else [],
+        "skins": [{"joints": skin, "inverseBindMatrices": writer.add(inverse.swapaxes(1, 2))}] if skinned else [],
         "animations": [
             {
                 "name": "a walk",

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.body.plausibility import joint_positions
 from clothjax.files import storage
-from data_prep import character, gltf, gltf_file, procedural, skeleton, templates, wrap
+from data_prep import character, gltf, gltf_file, gltf_motion, procedural, retarget, skeleton, templates, wrap
 
 QUARTER = Rotation.from_euler("x", -90, degrees=True).as_matrix()
 HALF = np.diag([-1.0, 1.0, -1.0])
@@ -55,6 +55,7 @@ def dialect(name, rig, axes):
         ),
         "vrm 1": (numbered, {"axes": axes, "extensions": {"VRMC_vrm": {"humanoid": {"humanBones": new}}}}),
         "z up": (rig.names, {"turn": QUARTER.T, "axes": axes}),
+        "no skin": (rig.names, {"axes": axes, "armature": (np.eye(3), 0.01), "skinned": False}),
         "posed": (rig.names, {"axes": axes, "shown": 30, "unit": 0.01, "armature": (QUARTER, 0.1)}),
     }[name]
 
@@ -83,6 +84,29 @@ def renamed(name, names, rig):
     """Names as the body has them: joints of no scheme, if they are parts of a body, are called as CMU's."""
     known = set(rigged.VRM) - {"Neck"} if name.startswith("vrm") else set()
     return [joint if joint in known else own for own, joint in zip(names, rig.names)]
+
+
+@pytest.mark.parametrize("name", ["ours", "mixamo", "unreal", "vrm 0", "vrm 1", "z up", "no skin", "posed"])
+def test_an_animation_is_retargeted_to_another_body(name, rig, walk, axes, tmp_path):
+    names, options = dialect(name, rig, axes)
+    rigged.write(tmp_path / "c.glb", rig.body, names, walk, **options)
+    capture = gltf_motion.read_gltf(tmp_path / "c.glb", walk.fps)
+    found = retarget.retarget(capture, rig.body, rig.names, freeze=False, about="c.glb")
+    places, expected = joint_positions(found, rig.body), joint_positions(walk, rig.body)
+    apart = np.linalg.norm((places - places[:, :1]) - (expected - expected[:, :1]), axis=-1)
+    assert apart.max() < 1e-4
+    assert np.abs(found.translation - walk.translation).max() < 0.005  # where the ground is
+
+
+def test_an_animation_is_named_where_there_are_several(rig, walk, tmp_path):
+    path = tmp_path / "c.glb"
+    rigged.write(path, rig.body, rig.names, walk)
+    with pytest.raises(ValueError, match=r"c\.glb: which of its animations \(--animation\)\? There are a walk"):
+        gltf_motion.read_gltf(path, 30.0, "a run")
+    assert gltf_motion.read_gltf(path, 60.0, "a walk").rotations.shape[0] == 79
+    trimesh.creation.icosphere().export(tmp_path / "ball.glb")
+    with pytest.raises(ValueError, match=r"ball\.glb: it has no animation"):
+        gltf_motion.read_gltf(tmp_path / "ball.glb", 30.0)
 
 
 def written(tmp_path, body, names, walk, **options):
