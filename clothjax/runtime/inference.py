@@ -144,13 +144,13 @@ def resting(before: State, after: State, tolerance: float = 2.5e-4) -> Array:
     Args:
         before, after: the states around the step.
         tolerance: of the code, in standard deviations; a tenth of it, in rad and m, of the poses and, with forces, of
-            the cloth in place of the code.
+            how far the cloth has still to go, in place of the code.
     """
     moved = [x[0] - x[1] for x in (after.rotations, after.translation)]
     if after.drape is None:
         moved.append(0.1 * (after.latent - before.latent))
     else:  # its code is not in standard deviations
-        moved.append(after.drape.velocity)
+        moved.append(after.drape.velocity / (1.0 - drape.SLOWING))
     return jnp.all(jnp.stack([jnp.max(jnp.abs(x)) < 0.1 * tolerance for x in moved]))
 
 

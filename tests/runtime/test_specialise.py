@@ -75,7 +75,7 @@ def test_exact_folds_of_a_shipped_garment(motion):
 
 @pytest.mark.parametrize("kind", ["skip", "relu"])
 def test_fewer_blend_shapes_err_less_the_more_there_are(kind, wide, motion):
-    model = cj.load("skirt") if kind == "skip" else wide
+    model = cj.load("tshirt") if kind == "skip" else wide
     clip = Motion(motion.rotations[:100], motion.translation[:100], motion.fps)
     all_of_them = len(model.network.shapes)
     errors = []
@@ -154,7 +154,7 @@ def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
 
 def test_fewer_shapes_bear_eight_bits():
     """Their coordinates do not cancel each other: rounding them does not hurt more than leaving shapes out."""
-    model = loading.load("skirt")
+    model = loading.load("tshirt")
     clip = storage.load_motion("walk_3", model.names)
     motion = Motion(clip.rotations[:60], clip.translation[:60].astype(np.float32), clip.fps)
     for count in (192, 64):
