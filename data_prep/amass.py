@@ -3,12 +3,13 @@
     python -m data_prep.amass 01_01_poses.npz out.h5 --body body.h5 --fps 30
 
 SMPL's poses are relative to a T-pose, so the skeleton of the recorded person is not needed. Hands and toes stay still.
-Poses may be axis-angle, quaternions or matrices. The files have z up; others show that by how their figures stand.
+Poses may be axis-angle, quaternions, matrices or their first two columns (6D). The files have z up; others show that by
+how their figures stand.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import tyro
@@ -18,26 +19,42 @@ from clothjax.files.damage import UNREADABLE
 from clothjax.files.storage import Rig, canonical_rotation, load_rig
 from clothjax.types import Motion
 from data_prep import skeleton
-from data_prep.program import METRES, MotionOptions, Unit, run, write_motion
+from data_prep.doubts import FASTEST, ground
+from data_prep.program import METRES, Axis, MotionOptions, Unit, run, write_motion
 from data_prep.recording import Capture, resample
+from data_prep.rest_pose import AXES, UPRIGHT, turn_upright
 from data_prep.retarget import FROZEN, from_t_pose, leg_length, stand
 from data_prep.skeleton import cmu_names
 from data_prep.smpl import BODY
 
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-FASTEST, HIGHEST = 15.0, 10.0  # m/s and m, of a pelvis whose path is in metres
+HIGHEST = 10.0  # m, of a pelvis whose path is in metres
+LARGEST = 4 * np.pi  # rad, of a turn that is not in degrees
+BENT, ONE_WAY = (
+    0.1,
+    0.5,
+)  # rad of knees and elbows on average, and the share of it in one direction, that show which way
 
 
-def read_amass(path: str | Path, up: Literal["y", "z"] | None = None, units: Unit = "m") -> Capture:
+def read_amass(
+    path: str | Path,
+    up: Axis | None = None,
+    units: Unit = "m",
+    allow: bool = False,
+    tell: Callable[[str], object] = str,
+) -> Capture:
     """Read a recording with +Y up and CMU's joint names; it has no skeleton, so its offsets are zero.
 
     Args:
         path: .npz.
         up: axis that points up; None for the one along which the figures stand.
         units: of the path.
+        allow: take another axis than that, and knees and elbows that bend the wrong way.
+        tell: called with a line if it is not z that is up.
 
     Raises:
-        ValueError: naming the file, the array and the first wrong entry; for a path that is not in `units`.
+        ValueError: naming the file, the array and the first wrong entry; for a path that is not in `units`; for what
+            `allow` would take.
     """
     try:
         with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -60,18 +77,27 @@ def read_amass(path: str | Path, up: Literal["y", "z"] | None = None, units: Uni
         raise ValueError(f"{path}: {rate} is {fps}, not a rate in Hz")
     rotations = _matrices(poses, path)[:, : len(BODY)]
     trans = trans * METRES[units]
+    wrong = [part for part, one_way in _bends(rotations).items() if one_way < -ONE_WAY]
+    if wrong and not allow:
+        raise ValueError(
+            f"{path}: {' and '.join(wrong)} bend the wrong way: left and right are exchanged, or an axis is negated; "
+            "convert it again, --allow takes it all the same"
+        )
     stands = rotations[:, 0, :, 1].mean(axis=0)  # SMPL's pelvis has +y up
-    if up is None:
-        up = "y" if stands[1] > 0.6 and stands[1] > stands[2] else "z"
+    seen = max(AXES, key=lambda axis: float(stands @ AXES[axis]))
+    seen = seen if stands @ AXES[seen] > UPRIGHT else None
+    if up is not None and seen not in (None, up) and not allow:
+        raise ValueError(f"{path}: --up {up}, but its figure stands along {seen}; --allow takes it all the same")
+    if up is None and seen not in (None, "z"):
+        tell(f"{seen} is up, for the figure stands along it; --up says otherwise")
+    up = up or seen or "z"
     speed = np.linalg.norm(np.diff(trans, axis=0), axis=1).max(initial=0.0) * fps.item()
-    height = abs(float(np.median(trans[:, "xyz".index(up)])))
+    height = abs(float(np.median(trans @ AXES[up])))
     if units == "m" and (speed > FASTEST or height > HIGHEST):
         found = f"up to {speed:.0f} m/s, {height:.0f} m high"
         raise ValueError(f"{path}: trans looks like centimetres ({found}): give --units cm, or mm, or cut jumps out")
-    if up == "z":
-        turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
-        rotations[:, 0] = turn @ rotations[:, 0]
-        trans = trans @ turn.T
+    turn = turn_upright(AXES[up])
+    rotations[:, 0], trans = turn @ rotations[:, 0], trans @ turn.T
     return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, fps.item())
 
 
@@ -79,10 +105,15 @@ def _matrices(poses: np.ndarray, path: str | Path) -> np.ndarray:
     """Return rotations [T, J, 3, 3] of poses, which their shape and norms tell apart.
 
     Args:
-        poses: axis-angle [T, 3 J] or [T, J, 3], quaternions [T, 4 J] or [T, J, 4], or matrices [T, J, 3, 3].
+        poses: axis-angle [T, 3 J] or [T, J, 3], quaternions [T, 4 J] or [T, J, 4], matrices [T, J, 3, 3], or two of
+            their columns or rows [T, 6 J], [T, J, 6] or [T, J, 3, 2].
         path: of the file, for messages.
     """
     frames, joints = len(poses), len(BODY)
+    if poses.shape[2:] in ((6,), (3, 2)) or (poses.ndim == 2 and poses.shape[1] % 6 == 0):
+        found = _of_six(poses.reshape(frames, -1, 6), path)
+        if found is not None:
+            return found
     if poses.shape[2:] == (3, 3):
         turned = poses @ np.swapaxes(poses, -1, -2)
         if poses.shape[1] >= joints and np.abs(turned - np.eye(3)).max() < 1e-2 and np.linalg.det(poses).min() > 0:
@@ -99,13 +130,59 @@ def _matrices(poses: np.ndarray, path: str | Path) -> np.ndarray:
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or flat.shape[1] < 3 * joints or flat.shape[1] % 3:
         raise ValueError(
             f"{path}: poses {poses.shape}: expected axis-angle [T, J, 3], quaternions [T, J, 4] or matrices "
-            f"[T, J, 3, 3] of at least {joints} joints (6D: which convention it has is not seen; convert it)"
+            f"[T, J, 3, 3] of at least {joints} joints, or two columns of those; convert it"
         )
+    largest = np.linalg.norm(flat.reshape(-1, 3), axis=-1).max()
+    if largest > LARGEST:
+        raise ValueError(f"{path}: poses turn by up to {largest:.0f} rad: are they in degrees? Convert it to radians")
     return Rotation.from_rotvec(flat.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
 
 
+def _of_six(sixes: np.ndarray, path: str | Path) -> np.ndarray | None:
+    """Return the rotations [T, J, 3, 3] of which two columns or rows are given, None if [T, J, 6] are none of these.
+
+    The two follow each other or alternate: only as they are meant are they at right angles. Columns alternate; of those
+    that follow each other the knees show what they are, for they bend one way.
+    """
+    pair = sixes.reshape(*sixes.shape[:2], 2, 3)
+    layouts = {"in a row": (pair[..., 0, :], pair[..., 1, :]), "alternating": (sixes[..., ::2], sixes[..., 1::2])}
+    for layout, (a, b) in layouts.items():
+        products = np.stack([np.sum(a * a, axis=-1) - 1, np.sum(b * b, axis=-1) - 1, np.sum(a * b, axis=-1)])
+        if np.abs(products).max() < 1e-2:
+            columns = np.stack([a, b, np.cross(a, b)], axis=-1)
+            if columns.shape[1] < len(BODY):
+                return None
+            one_way = 1.0 if layout == "alternating" else _bends(columns).get("knees", 0.0)
+            if abs(one_way) < ONE_WAY:
+                raise ValueError(
+                    f"{path}: poses {sixes.shape} are 6D, but its knees do not show by their bend whether they are "
+                    "columns or rows of matrices; convert it to axis-angle"
+                )
+            return columns if one_way > 0 else np.swapaxes(columns, -1, -2)
+    return None
+
+
+def _bends(rotations: np.ndarray) -> dict[str, float]:
+    """Return which way knees and elbows bend: 1 as of a body, -1 the other way; those that hardly do are left out.
+
+    Args:
+        rotations: [T, J, 3, 3] of SMPL's joints.
+    """
+    joints = [BODY.index(name) for name in ("left_knee", "right_knee", "left_elbow", "right_elbow")]
+    turned = Rotation.from_matrix(rotations[:, joints].reshape(-1, 3, 3)).as_rotvec().reshape(-1, 4, 3)
+    angles = {"knees": turned[:, :2, 0], "elbows": turned[:, 2:, 1] * [-1, 1]}
+    sizes = {part: float(np.abs(bend).mean()) for part, bend in angles.items()}
+    return {part: float(bend.mean()) / sizes[part] for part, bend in angles.items() if sizes[part] > BENT}
+
+
 def retarget_amass(
-    capture: Capture, body_file: str | Path, *, fps: float = 30.0, leg: float = 0.8, freeze: bool = True
+    capture: Capture,
+    body_file: str | Path,
+    *,
+    fps: float = 30.0,
+    leg: float = 0.8,
+    freeze: bool = True,
+    tell: Callable[[str], object] = str,
 ) -> tuple[Motion, Rig]:
     """Retarget a recording onto the body in a file, starting above the origin and standing on y = 0.
 
@@ -115,6 +192,7 @@ def retarget_amass(
         fps: frames per second of the result.
         leg: m, from hip to ankle of the recorded person; the path is scaled to the body's leg.
         freeze: keep toes and wrists as in the canonical pose.
+        tell: called with a line if it does not stand on the file's zero.
 
     Returns:
         The motion, and the body with its joint names.
@@ -135,7 +213,10 @@ def retarget_amass(
     rotations = from_t_pose(local, rig.body, names, canonical_rotation(body_file))
     scale = leg_length(rig.body.joints, skeleton.find(names, rig.body.parents, str(body_file))) / leg
     path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale
-    return stand(Motion(rotations.astype(np.float32), path, fps), rig.body), rig
+    motion = stand(Motion(rotations.astype(np.float32), path, fps), rig.body)
+    for line in ground(float(path[0, 1] - motion.translation[0, 1])):
+        tell(line)
+    return motion, rig
 
 
 @dataclass(frozen=True)
@@ -145,8 +226,10 @@ class Arguments(MotionOptions):
     motion: tyro.conf.Positional[Path]
     """.npz as published."""
     output: tyro.conf.Positional[Path]
-    up: Literal["y", "z"] | None = None
+    up: Axis | None = None
     """Axis of the file that points up; it is the one along which the figures stand unless given."""
+    allow: bool = False
+    """Take another axis than that, and knees and elbows that bend the wrong way."""
     units: Unit = "m"
     """Unit of the path."""
     leg: float = 0.8
@@ -155,8 +238,12 @@ class Arguments(MotionOptions):
 
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
-    capture = read_amass(args.motion, args.up, args.units)
-    motion, rig = retarget_amass(capture, args.body, fps=args.fps, leg=args.leg, freeze=args.freeze)
+
+    def tell(line: str) -> None:
+        print(f"{args.motion}: {line}")
+
+    capture = read_amass(args.motion, args.up, args.units, args.allow, tell)
+    motion, rig = retarget_amass(capture, args.body, fps=args.fps, leg=args.leg, freeze=args.freeze, tell=tell)
     write_motion(args.output, motion, rig, args.motion, args)
 
 

@@ -6,6 +6,7 @@ Plain or .gz. Which joint is which is known of many programs (`skeleton.py`), or
 frames say which way is up, and how a joint is turned in a T-pose.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,14 +17,22 @@ from scipy.spatial.transform import Rotation
 from clothjax.files.storage import load_rig
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
 from data_prep.recording import Capture, numbers, read_lines
+from data_prep.rest_pose import figure
 from data_prep.skeleton import cmu_names
 
 SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of motion capture
+USUAL = (24.0, 25.0, 30.0, 50.0, 60.0, 72.0, 90.0, 100.0, 120.0, 200.0, 240.0)  # of which others may be rounded
+APART, JUMP = 3.0, 0.1  # of the farthest later jump, and of the longest bone: the jump after an added T-pose
+STRAIGHT, TURNED = 1 + 2 * np.cos(np.radians([0.1, 10.0]))  # traces of rotations by 0.1 and by 10 degrees
 STILL = 1e-3  # of the longest bone, by which a joint that does not move on its parent may move
 
 
-def read_bvh(path: str | Path) -> Capture:
+def read_bvh(path: str | Path, tell: Callable[[str], object] = str) -> Capture:
     """Read the recording in a BVH file.
+
+    Args:
+        path: of the file.
+        tell: called with a line if its Frame Time has too few digits to be what it says.
 
     Raises:
         ValueError: naming file and line.
@@ -45,6 +54,9 @@ def read_bvh(path: str | Path) -> Capture:
             f"{path}, line {line}: a Frame Time of {duration:g} would be {1 / duration:.3g} frames a second: it is in "
             f"seconds, such as {1 / 30:.4f}"
         )
+    fps = _rate(words[2], duration)
+    if abs(fps * duration - 1) > 5e-3:
+        tell(f"a Frame Time of {words[2]} is taken as {fps:g} frames a second")
     width = sum(map(len, channels))
     rows = []
     for line, words in lines:
@@ -66,9 +78,15 @@ def read_bvh(path: str | Path) -> Capture:
         for k, axis in [] if added else moving:
             places[:, j, axis] = values[:, k]
         column += len(own)
-    # CMU's rate is 120, its files say 0.0083333: without rounding every clip would be interpolated
     plain = cmu_names(tuple(name.rpartition(":")[2] for name in names))  # Mixamo writes mixamorig:Hips
-    return _below_the_path(plain, parents, places, rotations, round(1 / duration, 2))
+    return _below_the_path(plain, parents, places, rotations, fps)
+
+
+def _rate(text: str, duration: float) -> float:
+    """Return the usual rate that a Frame Time is the rounded time of, or its own: CMU writes 0.0083333 for 120 Hz."""
+    digits = len(text.partition(".")[2]) if "e" not in text.lower() else 17
+    usual = [rate for rate in USUAL if abs(duration - 1 / rate) < 1.01 * 10.0**-digits]
+    return min(usual, key=lambda rate: abs(duration - 1 / rate), default=round(1 / duration, 2))
 
 
 def _below_the_path(
@@ -92,6 +110,19 @@ def _below_the_path(
         names, offsets, parents = names[1:], offsets[1:], [-1, *(parent - 1 for parent in parents[2:])]
     offsets[0] = 0.0  # the root has its path
     return Capture(names, np.array(parents), offsets, rotations, places[:, 0], fps)
+
+
+def _begins_apart(capture: Capture) -> bool:
+    """Return whether the first frame has no rotations but the root's, or a joint jumps after it as never later."""
+    if len(capture.rotations) < 3:
+        return False
+    turned = np.trace(capture.rotations[:2, 1:], axis1=-2, axis2=-1).min(axis=1, initial=3.0)  # 3: not at all
+    if turned[0] > STRAIGHT and turned[1] < TURNED:
+        return True
+    moved = figure(capture, capture.rotations, capture.translation).positions
+    jumps = np.linalg.norm(np.diff(moved, n=2, axis=0), axis=-1).max(axis=1, initial=0.0)
+    least = JUMP * np.linalg.norm(capture.offsets, axis=1).max(initial=0.0)
+    return jumps[0] > max(APART * jumps[1:].max(initial=0.0), least)
 
 
 def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarray, list[list[str]]]:
@@ -156,7 +187,9 @@ class Arguments(SkeletonOptions):
 
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
-    rig, capture = load_rig(args.body), read_bvh(args.motion)
+    rig, capture = load_rig(args.body), read_bvh(args.motion, lambda line: print(f"{args.motion}: {line}"))
+    if not args.skip and _begins_apart(capture):
+        print(f"{args.motion}: frame 0 is far from the next, as an added T-pose is: --skip 1 leaves it out")
     capture = capture._replace(rotations=capture.rotations[args.skip :], translation=capture.translation[args.skip :])
     motion = retarget_as_asked(capture, rig, args, args.motion)
     write_motion(args.output, motion, rig, args.motion, args)

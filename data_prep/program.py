@@ -12,6 +12,7 @@ from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
 from clothjax.types import Motion
 from data_prep import skeleton
+from data_prep.doubts import doubts
 from data_prep.recording import Capture
 from data_prep.repair import Bad, mend
 from data_prep.retarget import Axes, retarget
@@ -112,6 +113,7 @@ def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, reco
         axes=Axes(options.up, options.forward),
         allow=options.allow,
         about=str(recording),
+        tell=lambda line: print(f"{recording}: {line}"),
     )
 
 
@@ -128,4 +130,6 @@ def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, option
     motion, report = mend(motion, rig.body, options.bad)
     name = recording.name.partition(".")[0]
     save_motion(output, motion, rig.names, name=name, source=recording.name, licence=options.licence)
+    for doubt in doubts(motion, rig.body, rig.names):
+        print(f"{recording}: {doubt}")
     print(f"{output}: {len(motion.translation)} frames, {report}")

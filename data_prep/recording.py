@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 
 class Capture(NamedTuple):
@@ -22,7 +23,7 @@ class Capture(NamedTuple):
 
 
 def resample(capture: Capture, fps: float) -> Capture:
-    """Resample a recording: take every k-th frame, or interpolate if the rates are not multiples.
+    """Resample a recording: take every k-th frame, or interpolate by cubic splines if rates are no multiples.
 
     Raises:
         ValueError: for a rate that is not > 0, or a recording of fewer than two frames.
@@ -41,8 +42,8 @@ def resample(capture: Capture, fps: float) -> Capture:
     new = np.minimum(new, old[-1])
     rotations = np.empty((len(new), *capture.rotations.shape[1:]))
     for j in range(rotations.shape[1]):
-        rotations[:, j] = Slerp(old, Rotation.from_matrix(capture.rotations[:, j]))(new).as_matrix()
-    translation = np.stack([np.interp(new, old, x) for x in capture.translation.T], axis=1)
+        rotations[:, j] = RotationSpline(old, Rotation.from_matrix(capture.rotations[:, j]))(new).as_matrix()
+    translation = CubicSpline(old, capture.translation)(new)
     return capture._replace(rotations=rotations, translation=translation, fps=fps)
 
 

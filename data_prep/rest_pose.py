@@ -15,7 +15,9 @@ from data_prep.skeleton import SIDES, Parts, ancestors
 AXES = {sign + axis: (1 - 2 * (sign == "-")) * np.eye(3)["xyz".index(axis)] for axis in "xyz" for sign in ("", "-")}
 UPRIGHT = 0.6  # least cosine between the figure, on average over the frames, and the axis that is up
 STRAIGHT = 40.0  # degrees, by which trunk and legs of a rest pose may be off the vertical
+ALONG = 3.0  # degrees, by which a rest pose that faces along an axis may be off it
 BENT = 0.15  # least sine of the angle of a knee or elbow that shows its hinge
+SEEN = 0.05  # share of the frames in which knees are bent, that shows which way they do
 
 
 class Figure(NamedTuple):
@@ -78,6 +80,31 @@ def up_axis(moving: Figure, parts: Parts, rest: str | None) -> str | None:
     return name
 
 
+def sides(moving: Figure, parts: Parts) -> str:
+    """Say how left and right of a figure contradict its shape, as in a mirror or with swapped names; or nothing.
+
+    Toes point to the front of a shin, knees bend to its back, and arms are on the side of their legs.
+    """
+    limbs, found = parts.limbs, []
+    left = moving.bone(limbs["right thigh"], limbs["left thigh"])
+    toes, knees = [], []
+    for side in SIDES:
+        thigh, shin, foot, toe = (limbs.get(f"{side} {part}") for part in ("thigh", "shin", "foot", "toe"))
+        upper, lower = moving.bone(thigh, shin), moving.bone(shin, foot)
+        knees.append(np.sum(np.cross(upper, lower) * left, axis=1))
+        if toe is not None:
+            toes.append(np.sum(np.cross(left, -lower) * moving.bone(foot, toe), axis=1))
+    bent = np.abs(np.concatenate(knees)) > 2 * BENT
+    if len(toes) and np.mean(toes) < 0:
+        found.append("toes point backward")
+    if bent.mean() > SEEN and np.concatenate(knees)[bent].mean() < 0:
+        found.append("knees bend forward")
+    arms = [limbs.get(f"{side} upper arm") for side in SIDES]
+    if None not in arms and np.mean(np.sum(moving.bone(arms[1], arms[0]) * left, axis=1)) < 0:
+        found.append("arms are on the other side than their legs")
+    return " and ".join(found)
+
+
 def is_rest_pose(resting: Figure, parts: Parts) -> str | None:
     """Return the axis that points up in a pose [1, n] in which a figure stands with arms apart; None if it does not."""
     at = resting.positions[0]
@@ -95,20 +122,45 @@ def is_rest_pose(resting: Figure, parts: Parts) -> str | None:
     return name if all(good) else None
 
 
-def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts) -> np.ndarray:
+def rest_turn(resting: Figure, parts: Parts, up: str) -> np.ndarray:
+    """Return the rotation [3, 3] that lets a rest pose stand along +y and face +z; if nearly so, that of the axes."""
+    turn = turn_upright(AXES[up])
+    across = turn @ resting.bone(parts.limbs["right thigh"], parts.limbs["left thigh"])[0]
+    heading = np.degrees(np.arctan2(across[2], across[0]))
+    return turn if abs(heading) < ALONG else Rotation.from_euler("y", heading, degrees=True).as_matrix() @ turn
+
+
+def straightest(shown: Figure, parts: Parts) -> int:
+    """Return the frame in which a figure with +y up stands most like a body at rest: trunk and legs straight."""
+    limbs = parts.limbs
+    left = shown.bone(limbs["right thigh"], limbs["left thigh"])
+    bones = [shown.bone(parts.hips, parts.chain[-1])[:, 1]]
+    for side in SIDES:
+        thigh, shin, foot = (limbs[f"{side} {part}"] for part in ("thigh", "shin", "foot"))
+        bones += [-shown.bone(thigh, shin)[:, 1], -shown.bone(shin, foot)[:, 1]]
+        if f"{side} forearm" in limbs:
+            bones.append(-0.2 * shown.bone(limbs[f"{side} upper arm"], limbs[f"{side} forearm"])[:, 1])
+    if "left upper arm" in limbs and "right upper arm" in limbs:
+        bones.append(np.sum(left * shown.bone(limbs["right upper arm"], limbs["left upper arm"]), axis=1))
+    return int(np.sum(bones, axis=0).argmax())
+
+
+def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts, frame: int) -> np.ndarray:
     """Return world rotations [n, 3, 3] of the joints of a figure in a T-pose, facing +z, from its frames.
 
-    The trunk is straight: where its joints are not turned, or if it is not so then, as on average. Arms point sideways,
+    The trunk is straight: where its joints are not turned, or if it is not so then, in a frame. Arms point sideways,
     legs down. Knees and elbows say how they are turned about that: they bend one way only. Any other joint is turned on
-    its parent as on average.
+    its parent as in that frame.
 
     Args:
         shown: all frames, +y up.
         resting: the pose without any rotation, of which the offsets between joints are used.
         parents: [n].
         parts: of the figure.
+        frame: in which it stands straight.
     """
-    limbs, turned = parts.limbs, _trunk(shown, resting, parts)
+    then = Figure(shown.positions[[frame]], shown.rotations[[frame]])
+    limbs, turned = parts.limbs, _trunk(then, resting, parts)
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         arm = [limbs.get(f"{side} {part}") for part in ("upper arm", "forearm", "hand")]
         turned |= _limb(shown, arm, np.array([sign, 0, 0]), np.array([0, -sign, 0]))
@@ -119,8 +171,7 @@ def standing(shown: Figure, resting: Figure, parents: np.ndarray, parts: Parts) 
         if j in turned:
             result[j] = turned[j]
         elif parent >= 0:
-            on_parent = np.swapaxes(shown.rotations[:, parent], -1, -2) @ shown.rotations[:, j]
-            result[j] = result[parent] @ Rotation.from_matrix(on_parent).mean().as_matrix()
+            result[j] = result[parent] @ then.rotations[0, parent].T @ then.rotations[0, j]
     return result
 
 

@@ -5,6 +5,7 @@ figure stands like the body (`rest_pose.py`). Bones of arms and legs are aligned
 The root's path is scaled by the length of a leg. At last the result is compared with the recording.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.body.plausibility import body_kinematics, joint_positions
 from clothjax.types import Body, Motion
-from data_prep import skeleton
+from data_prep import rest_pose, skeleton
+from data_prep.doubts import ground
 from data_prep.recording import Capture, resample
-from data_prep.rest_pose import AXES, Figure, figure, is_rest_pose, standing, turn_upright, unit, up_axis
+from data_prep.rest_pose import AXES, Figure, figure, is_rest_pose, turn_upright, unit
 from data_prep.skeleton import Parts, cmu_names
 
 FROZEN = ("Hand", "Finger", "Thumb", "Toe")
@@ -44,6 +46,7 @@ def retarget(
     axes: Axes = FOUND,
     allow: bool = False,
     about: str = "the recording",
+    tell: Callable[[str], object] = str,
 ) -> Motion:
     """Retarget a recording onto a body's joints, starting above the origin and standing on y = 0.
 
@@ -52,17 +55,19 @@ def retarget(
         body: to move.
         names: of its joints.
         parts: of the recording; None to find them by the names of its joints.
-        fps: frames per second of the result; rotations between two frames are interpolated on the sphere.
+        fps: frames per second of the result; between two frames rotations follow a spline on the sphere.
         abduct: degrees by which the upper arms are taken outward.
         drop_clavicles: degrees by which the clavicles are lowered.
         freeze: keep hands, fingers and toes as in the canonical pose; captured ones are often noise.
         axes: of the recording.
         allow: take a result that differs from the recording.
         about: name of the recording, for messages.
+        tell: called with a line about each thing that had to be read off the frames, or is hardly meant.
 
     Raises:
-        ValueError: if parts of the body are missing; if it is not seen which way is up, or the axes do not go together;
-            if the result differs from the recording; if the recording is shorter than two frames.
+        ValueError: if parts of the body are missing; if it is not seen which way is up, or another way than `axes` has
+            it, or the axes do not go together; if left and right contradict the figure; if the result differs from the
+            recording; if the recording is shorter than two frames.
     """
     capture = resample(capture, fps)
     names = cmu_names(names)
@@ -70,17 +75,21 @@ def retarget(
     of_file = skeleton.find(capture.names, capture.parents, about) if parts is None else parts
     shown = figure(capture, capture.rotations, capture.translation)
     resting = figure(capture, np.tile(np.eye(3), (1, len(capture.names), 1, 1)), np.zeros((1, 3)))
+    wrong = "" if allow else rest_pose.sides(shown, of_file)
+    if wrong:
+        raise ValueError(
+            f"{about}: {wrong}: left and right are exchanged in the names, or an axis is negated; "
+            "export it again or rename the joints; --allow takes it all the same"
+        )
     rest = is_rest_pose(resting, of_file)
-    up = axes.up or up_axis(shown, of_file, rest)
-    if up is None:
-        raise ValueError(f"{about}: it does not show which way is up: give --up y or --up z")
-    if axes.forward is not None and axes.forward[-1] == up[-1]:
-        raise ValueError(f"{about}: {up} is up, so --forward {axes.forward} cannot be forward")
+    up = _up(shown, of_file, rest, axes, about, allow, tell)
     shown = shown.turned(turn_upright(AXES[up], None if axes.forward is None else AXES[axes.forward]))
     if rest is None:
-        reference = standing(shown, resting, capture.parents, of_file)
+        frame = rest_pose.straightest(shown, of_file)
+        reference = rest_pose.standing(shown, resting, capture.parents, of_file, frame)
+        tell(f"its rest pose is no T-pose; trunk and shoulders are taken to be straight in frame {frame} of the result")
     else:
-        reference = np.tile(turn_upright(AXES[rest]), (len(capture.names), 1, 1))
+        reference = np.tile(rest_pose.rest_turn(resting, of_file, rest), (len(capture.names), 1, 1))
     posed = figure(capture, relative(reference[None], capture.parents), np.zeros((1, 3))).positions[0]
 
     corrections = _corrections(abduct, drop_clavicles)
@@ -104,9 +113,28 @@ def retarget(
     path = shown.positions[:, of_file.hips]
     path = (path - path[0] * [1, 0, 1]) * scale - body.joints[0]
     motion = stand(Motion(relative(world, body.parents).astype(np.float32), path, float(fps)), body)
+    for line in ground(float(path[0, 1] - motion.translation[0, 1])):
+        tell(line)
     if not allow:
         compare(motion, body, of_body, shown, of_file, about, abduct + drop_clavicles)
     return motion
+
+
+def _up(
+    shown: Figure, parts: Parts, rest: str | None, axes: Axes, about: str, allow: bool, tell: Callable[[str], object]
+) -> str:
+    """Return the axis of a file that points up, as asked or as its frames show it; `retarget` has the arguments."""
+    seen = rest_pose.up_axis(shown, parts, rest)
+    up = axes.up or seen
+    if up is None:
+        raise ValueError(f"{about}: it does not show which way is up: give --up y or --up z")
+    if axes.forward is not None and axes.forward[-1] == up[-1]:
+        raise ValueError(f"{about}: {up} is up, so --forward {axes.forward} cannot be forward")
+    if seen not in (None, up) and not allow:
+        raise ValueError(f"{about}: --up {up}, but its figure stands along {seen}; --allow takes it all the same")
+    if axes.up is None and up != "y":
+        tell(f"{up} is up, for the figure stands along it; --up says otherwise")
+    return up
 
 
 def relative(world: np.ndarray, parents: np.ndarray) -> np.ndarray:

@@ -251,7 +251,7 @@ def _limbs(sided: dict, parents: np.ndarray, parts: tuple[str, ...], schemes: tu
 def _whole(names: tuple[str, ...], parents: np.ndarray, limbs: dict, central: dict, about: str, allow: bool) -> Parts:
     """Complete the parts: the hips carry both legs, the chest both arms; the spine lies between, the neck above."""
     missing = [f"{side} {part}" for side in SIDES for part in NEEDED if f"{side} {part}" not in limbs]
-    head = next((central["", core] for core in ("head", "neck", "neck01") if ("", core) in central), None)
+    head = next((central["", core] for core in ("head", "spine006", "neck", "neck01") if ("", core) in central), None)
     if head is None:
         missing.append("head")
     if missing and not (allow and not {f"{side} {part}" for side in SIDES for part in LEG[:3]} & set(missing)):
