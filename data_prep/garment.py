@@ -18,8 +18,8 @@ import tyro
 from clothjax.files.storage import load_rig, save_garment
 from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
-from data_prep.placement import Placement, Up
-from data_prep.program import Unit, run
+from data_prep.placement import Placement
+from data_prep.program import Axis, Unit, run
 from data_prep.templates import build
 from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, bring
 
@@ -40,7 +40,7 @@ class Arguments:
     """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose."""
     units: Unit = "m"
     """Unit of length of the mesh."""
-    up: Up = "y"
+    up: Axis = "y"
     """Axis of the mesh that points up."""
     pin: str = "none"
     """Part of the mesh that is pinned to the body: `none`, its `highest` opening, borders `above:HEIGHT` in m, vertices

@@ -1,23 +1,27 @@
 """Where a mesh lies: in which unit, which way up, and whether that is around the body, or is the body itself."""
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import igl
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from clothjax.types import Body
 from data_prep.dressing import CLEARANCE, WINDING
 from data_prep.mesh_file import Mesh
-from data_prep.program import METRES, Unit
+from data_prep.program import METRES, Axis, Unit
+from data_prep.rest_pose import AXES, turn_upright
 
-Up = Literal["y", "z"]
 Surface = tuple[np.ndarray, np.ndarray]  # the body's vertices [B, 3] m float64 and faces [F, 3] int64
-TO_Y_UP = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+TO_Y_UP = {axis: turn_upright(direction) for axis, direction in AXES.items()}
 MAX_MEAN_DISTANCE = 0.25  # m, from the body, of a garment that is around it
+QUARTERS = (0, 90, 180, 270)  # degrees
 INSIDE_PENALTY = 10  # weight of the depth inside the body over the distance to it, in comparing units
 ON_BODY = 0.003  # m, from the body, of an object that is the body
+BELOW = 0.02  # m, below the soles
+AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
 SAMPLE = 500  # vertices that stand for all
 
 
@@ -25,7 +29,7 @@ class Placement(NamedTuple):
     """How a mesh is put around a body."""
 
     units: Unit = "m"
-    up: Up = "y"
+    up: Axis = "y"
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m
     turn: float = 0.0  # degrees about the vertical, before the shift
 
@@ -41,32 +45,24 @@ def check_place(path: str | Path, vertices: np.ndarray, surface: Surface, place:
     Raises:
         ValueError: naming the file, and the units and axis in which it would be.
     """
-    height = np.ptp(surface[0][:, 1])
-
-    def distances(units: str, up: str) -> tuple[float, float]:
-        """Return the mean distance to the body [m], without and with a penalty for the inside.
-
-        Both are infinite for a mesh far larger or smaller than the body.
-        """
-        points = place._replace(units=units, up=up)(vertices)
-        smallest = 0.05 if (units, up) == (place.units, place.up) else 0.15
-        if not smallest * height < np.ptp(points, axis=0).max() < 1.5 * height:
-            return np.inf, np.inf
-        sample = points[:: max(1, len(points) // SAMPLE)]
-        signed = igl.signed_distance(sample, *surface, sign_type=WINDING)[0]
-        distance = np.mean(np.abs(signed))
-        return float(distance), float(distance + INSIDE_PENALTY * np.mean(np.maximum(-signed, 0.0)))
-
-    by_placement = {(units, up): distances(units, up) for units in METRES for up in TO_Y_UP}
-    near = {key: penalised for key, (distance, penalised) in by_placement.items() if distance < MAX_MEAN_DISTANCE}
-    answered = near.get((place.units, place.up), np.inf)
-    if answered < np.inf and answered <= 2 * min(near.values()) + 0.01:
+    height, sample = np.ptp(surface[0][:, 1]), vertices[:: max(1, len(vertices) // SAMPLE)]
+    places = [place]
+    for units, scale in METRES.items():
+        if 0.15 * height < scale * np.ptp(vertices, axis=0).max() < 1.5 * height:
+            others = [up for up in TO_Y_UP if (units, up) != (place.units, place.up)]
+            turns = [(place.turn + turn) % 360 for turn in QUARTERS]
+            places += [place._replace(units=units, up=up, turn=turn) for up in others for turn in turns]
+    distance, depth = _fit(sample, surface, places)
+    cost = np.where(distance < MAX_MEAN_DISTANCE, distance + INSIDE_PENALTY * depth, np.inf)
+    large = 0.05 * height < METRES[place.units] * np.ptp(vertices, axis=0).max() < 1.5 * height
+    if large and cost[0] < np.inf and cost[0] <= 2 * cost.min() + 0.01:
         return
     size = np.ptp(vertices, axis=0)
     size_text = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {place.units}, {place.up.upper()} up"
-    if near:
-        units, up = min(near, key=near.get)
-        raise ValueError(f"{size_text}: that is not around the body. Is it meant to be --units {units} --up {up}?")
+    if cost.min() < np.inf:
+        meant = places[int(cost.argmin())]
+        flags = f"--units {meant.units} --up {meant.up}" + f" --turn {meant.turn:.0f}" * (meant.turn != place.turn)
+        raise ValueError(f"{size_text}: that is not around the body. Is it meant to be {flags}?")
     raise ValueError(
         f"{size_text}: not around the body in any unit. The body is {height:.2f} m high with its middle at "
         f"{np.round(0.5 * (surface[0].min(axis=0) + surface[0].max(axis=0)), 2)}: move the mesh onto the body in its "
@@ -100,23 +96,47 @@ def check_objects(path: str | Path, mesh: Mesh, placed: np.ndarray, surface: Sur
             )
 
 
-def better_place(points: np.ndarray, surface: Surface) -> str:
-    """Return a hint at a place of a garment [V, 3] m at which it is pushed less, if there is one."""
-    sample = points[:: max(1, len(points) // SAMPLE)]
-    middle = points.mean(axis=0)
+def better_place(vertices: np.ndarray, surface: Surface, place: Placement) -> str:
+    """Return a hint at a place at which a garment is less inside the body than where the user has it, or nothing.
 
-    def inside(turn: float, shift: tuple[float, float, float]) -> float:
-        signed = igl.signed_distance(Placement(turn=turn, shift=shift)(sample), *surface, sign_type=WINDING)[0]
-        return float(np.mean(np.maximum(CLEARANCE - signed, 0.0)) + 0.02 * np.mean(np.abs(signed)))
+    Args:
+        vertices: [V, 3] in the file's units.
+        surface: of the body.
+        place: of the user.
+    """
+    sample = vertices[:: max(1, len(vertices) // SAMPLE)]
+    middle = place(vertices).mean(axis=0)
 
-    heights, sides = np.arange(-0.4, 0.41, 0.05), (-0.2, -0.1, 0.0, 0.1, 0.2)
-    places = [(0.0, (0.0, float(y), 0.0)) for y in heights]
-    places += [(0.0, (x, 0.0, z)) for x in sides for z in sides]
-    places += [(turn, (0.0, 0.0, 0.0)) for turn in (90.0, 180.0, 270.0)]
-    centred = (-float(middle[0]), 0.0, -float(middle[2]))
-    best = min([*places, (0.0, centred)], key=lambda place: inside(*place))
-    if inside(*best) > 0.5 * inside(0.0, (0.0, 0.0, 0.0)):
-        return "Move the mesh onto the body, or name its body with --body; "
-    turn, shift = best
-    flag = f"--turn {turn:.0f}" if turn else "--shift " + " ".join(f"{x:.2f}" for x in shift)
-    return f"It would be nearer with {flag}; "
+    heights, sides = np.arange(-0.5, 0.51, 0.05), (-0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
+    shifts = [(0.0, float(y), 0.0) for y in heights] + [(x, 0.0, z) for x in sides for z in sides]
+    shifts.append((-float(middle[0]), 0.0, -float(middle[2])))
+    places = [place._replace(shift=tuple(np.add(place.shift, shift).tolist())) for shift in shifts]
+    places += [place._replace(up=up, turn=(place.turn + turn) % 360) for up in TO_Y_UP for turn in QUARTERS]
+    distance, depth = _fit(sample, surface, [place, *places], CLEARANCE)
+    better = (depth < 0.5 * depth[0]) & (distance < 1.5 * distance[0])
+    if not better.any():
+        return ""
+    best = [place, *places][int(np.where(better, depth + 0.02 * distance, np.inf).argmin())]
+    flags = [f"--up {best.up}"] * (best.up != place.up) + [f"--turn {best.turn:.0f}"] * (best.turn != place.turn)
+    flags += ["--shift " + " ".join(f"{x + 0.0:.2f}" for x in best.shift)] * (best.shift != place.shift)
+    return f"It would be nearer with {' '.join(flags)}; "
+
+
+def _fit(
+    sample: np.ndarray, surface: Surface, places: list[Placement], clearance: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance to the body and depth below its clearance, means in m of points [S, 3] at each of P places."""
+    points = np.concatenate([place(sample) for place in places])
+    signed = igl.signed_distance(points, *surface, sign_type=WINDING)[0].reshape(len(places), -1)
+    return np.abs(signed).mean(axis=1), np.maximum(clearance - signed, 0.0).mean(axis=1)
+
+
+def worn(vertices: np.ndarray, faces: np.ndarray, body: Body) -> str:
+    """Say where a garment [V, 3] m is worn, and whether it goes around any part of the body."""
+    low, high = vertices[:, 1].min(), vertices[:, 1].max()
+    soles = np.asarray(body.vertices)[:, 1].min()
+    around = np.abs(igl.fast_winding_number(vertices, faces, np.asarray(body.joints, np.float64)))
+    doubts = ["it goes around no part of the body"] * bool(around.max() < AROUND)
+    doubts += ["it reaches below the soles"] * bool(low < soles - BELOW)
+    said = f"worn from {low - soles:.2f} to {high - soles:.2f} m above the soles"
+    return f"{said}, but {' and '.join(doubts)}: is it worn elsewhere?" if doubts else said

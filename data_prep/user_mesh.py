@@ -17,7 +17,7 @@ from data_prep import marks, mesh_file
 from data_prep.dressing import WINDING, dress, limbs, push_out
 from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
-from data_prep.placement import Placement, Surface, better_place, check_objects, check_place
+from data_prep.placement import Placement, Surface, better_place, check_objects, check_place, worn
 from data_prep.remesh import resample
 from data_prep.seams import WELD_DISTANCE, check_seams, sewn
 
@@ -25,7 +25,7 @@ LOOSE_DISTANCE = 0.03  # m; a garment with a larger median distance to the body 
 DEEP, MAX_DEEP_SHARE = 0.03, 0.15  # m inside the body; a larger share of such vertices means another body
 MIN_VERTICES, MAX_VERTICES = 100, 20_000
 DIFFUSION_SAMPLES = 500  # for each vertex of a loose garment
-FARTHEST_PUSH = 0.03  # m, by which a garment that is worn is pushed out of the body at most
+FAR_PUSH, FARTHEST_PUSH = 0.01, 0.03  # m, by which a garment that is worn is pushed out of the body, and at most
 
 
 class Answers(NamedTuple):
@@ -94,7 +94,8 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
             f"{path}: {len(working.vertices)} vertices; {MIN_VERTICES} to {MAX_VERTICES} can be trained: "
             "give --vertices for another number"
         )
-    working = _push_out(path, working, surface, answers)
+    working = _push_out(path, working, surface, mesh.vertices, answers)
+    working = working.logged(worn(working.vertices, working.faces, body))
     distance = float(np.median(np.abs(igl.signed_distance(working.vertices, *surface, sign_type=WINDING)[0])))
     loose = distance > LOOSE_DISTANCE if answers.loose is None else answers.loose
     working = working.logged(
@@ -220,16 +221,16 @@ def _resample(working: Working, count: int) -> Working:
     return Working(vertices, faces, pinned, cloth, working.log).logged(line)
 
 
-def _push_out(path: str | Path, working: Working, surface: Surface, answers: Answers) -> Working:
-    """Push the garment out of the body; refuse one that is deep inside it or cannot be pushed out."""
-    points = working.vertices
+def _push_out(path: str | Path, working: Working, surface: Surface, in_file: np.ndarray, answers: Answers) -> Working:
+    """Push the garment, of vertices [V, 3] in its file, out of the body; refuse one that is deep inside or is stuck."""
+    points, lost = working.vertices, "Move the mesh onto the body, or name its body with --body; "
     signed = igl.signed_distance(points, *surface, sign_type=WINDING)[0]
     deep_share, deepest = float((signed < -DEEP).mean()), np.round(points[signed.argmin()], 2)
     if deep_share > MAX_DEEP_SHARE and not answers.allow:
         raise ValueError(
             f"{path}: {100 * deep_share:.0f} % of its vertices are more than {1e3 * DEEP:.0f} mm inside the body, "
             f"at most {-1e3 * signed.min():.0f}, at {deepest} m: it was made for another body or another pose, or is "
-            f"worn elsewhere. {better_place(points, surface)}--allow takes it as it is"
+            f"worn elsewhere. {better_place(in_file, surface, answers.placement) or lost}--allow takes it as it is"
         )
     cleared = push_out(points, working.faces, *surface)
     signed = igl.signed_distance(cleared, *surface, sign_type=WINDING)[0]
@@ -237,7 +238,7 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
         place = np.round(points[signed.argmin()], 2)
         raise ValueError(
             f"{path}: {int((signed < 0).sum())} vertices cannot be pushed out of the body, the first at {place} m: "
-            "move them out of it"
+            f"{better_place(in_file, surface, answers.placement)}move them out of it"
         )
     moved = np.linalg.norm(cleared - points, axis=1)
     if moved.max() > FARTHEST_PUSH and not answers.allow:
@@ -245,13 +246,15 @@ def _push_out(path: str | Path, working: Working, surface: Surface, answers: Ans
         raise ValueError(
             f"{path}: {int((moved > FARTHEST_PUSH).sum())} vertices would be pushed out of the body by more than "
             f"{1e3 * FARTHEST_PUSH:.0f} mm, the farthest by {1e3 * moved.max():.0f} mm, at {place} m: it is not worn "
-            f"like that. {better_place(points, surface)}--allow takes it as it is"
+            f"like that. {better_place(in_file, surface, answers.placement) or lost}--allow takes it as it is"
         )
     working = working._replace(vertices=cleared)
     if not moved.any():
         return working
+    nearer = better_place(in_file, surface, answers.placement) if moved.max() > FAR_PUSH else ""
     return working.logged(
-        f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most"
+        f"pushed out of the body: {int((moved > 0).sum())} vertices, by {1e3 * moved.max():.0f} mm at the most",
+        *([nearer.removesuffix("; ")] if nearer else []),
     )
 
 

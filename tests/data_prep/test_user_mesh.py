@@ -333,6 +333,37 @@ def test_an_open_front_is_pinned_above_a_height(skirt, body, names, save):
             bring(path, body, names, Answers(pin=wrong))
 
 
+def test_where_it_is_worn_is_told(skirt, body):
+    vertices, faces = skirt
+    for shift, told in (
+        ((0, 0.04, 0), r"worn from 0\.\d\d to 1\.\d\d m above the soles$"),
+        ((0, 0, 0.6), "goes around no part of the body: is it worn elsewhere"),
+        ((0, -0.9, 0), "reaches below the soles: is it worn elsewhere"),
+    ):
+        assert re.search(told, placement.worn(vertices + np.array(shift), faces, body))
+
+
+@pytest.mark.parametrize("axis", ["x", "-x", "-y", "z", "-z"])
+@pytest.mark.parametrize("turn", [0, 90, 180])
+def test_any_quarter_turn_is_found(axis, turn, shirt, body, names, save):
+    """What the message proposes puts a shirt back, however it is turned."""
+    vertices, faces = shirt
+    about = Rotation.from_euler("y", -turn, degrees=True).as_matrix()
+    path = save(vertices @ about.T @ placement.TO_Y_UP[axis], faces)
+    with pytest.raises(ValueError, match=f"--units m --up {axis}" + f" --turn {turn}" * bool(turn) + r"\?"):
+        bring(path, body, names, Answers())
+    made, _ = bring(path, body, names, Answers(Placement("m", axis, turn=turn)))
+    assert nearest(made.vertices, vertices).max() < 1e-4
+
+
+def test_a_garment_that_is_pushed_a_little_is_told_a_better_place(body, names, save):
+    made = storage.load_garment("pants_1000", body)
+    vertices, faces = np.asarray(made.vertices, np.float64), np.asarray(made.faces)
+    _, said = bring(save(vertices - np.array([0, 0.05, 0]), faces), body, names, Answers())
+    assert "It would be nearer with --shift 0.00 0.05 0.00" in said
+    assert not any("nearer" in line for line in bring(save(vertices, faces), body, names, Answers())[1])
+
+
 @pytest.fixture(scope="module")
 def shirt(body):
     made = storage.load_garment("tshirt_1000", body)
