@@ -14,7 +14,7 @@ import onnxruntime
 
 from clothjax import material
 from clothjax.config import Config
-from clothjax.export import native, onnx, psi_ffi, stablehlo
+from clothjax.export import native, onnx, onnx_forces, psi_ffi, stablehlo
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import configuration, storage
 from clothjax.networks import decoder, psi
@@ -29,7 +29,7 @@ from experiments.benchmark.timing import Call
 matplotlib.use("Agg")
 
 PAPER = ["configs/paper_tshirt.yaml"]
-SHIPPED, FINE = "tshirt", "tshirt_4000"
+SHIPPED, FINE, FORCED = "tshirt", "tshirt_4000", "skirt"
 FRAMES = 300
 WARM = 3  # calls in a row of which the last is timed: what a game that draws nothing else would see
 CROWDS = (1, 4, 16, 64, 256, 1024)
@@ -48,6 +48,7 @@ def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS)
     best = min(near, key=lambda v: v["us"])
     shown = {"shipped_us": best["us"], "shipped_form": best["name"], "shipped_floor_us": best["floor_us"]}
     report["resting"] = _resting()
+    report["forces"] = _forces(rounds)
     return report | shown | {"shipped_onnx_us": min(v["us"] for v in near if v["runtime"] == "onnx")}
 
 
@@ -207,6 +208,25 @@ def _resting() -> dict:
     return {"frames": len(poses), "frames_moving": 20, "frames_taken": taken, "error_mm_max": 1e3 * error}
 
 
+def _forces(rounds: int) -> dict:
+    """Measure a garment of the library with forces, `FORCED`, beside the one without."""
+    calls: dict[str, Call] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        library = _library(folder)
+        for garment in (SHIPPED, FORCED):
+            model = specialise.specialise(loading.load(garment))
+            calls[f"{garment}: jax"] = jax_call(model)
+            for kind in ("onnx", "onnx, int8"):
+                path = onnx.to_onnx(model, folder / f"{garment}.onnx", int8=kind.endswith("int8"))
+                calls[f"{garment}: {kind}"] = onnx_call(path, model)
+            if library:
+                calls[f"{garment}: C"] = c_call(library, native.to_c(model, folder / f"{garment}.psi"), model)
+        us = interleaved(calls, rounds)
+    kinds = [call.partition(": ")[2] for call in calls if call.startswith(FORCED)]
+    return {"us": us, "ratio": {kind: us[f"{FORCED}: {kind}"] / us[f"{SHIPPED}: {kind}"] for kind in kinds}}
+
+
 def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
     """Measure microseconds a character in crowds in jax, each character with its own body."""
     wearers = [specialise.specialise(loading.load(SHIPPED, betas=np.full(10, 0.2 * i - 0.8))) for i in range(8)]
@@ -231,8 +251,10 @@ def interleaved(calls: dict[str, Call], rounds: int) -> dict[str, float]:
 def onnx_call(path: Path, model: Model) -> Call:
     """Return a call of one frame of an exported model."""
     pose = _pose(model)
-    tensors = (*onnx.first_state(model, pose), np.asarray(pose.rotations)[None], np.asarray(pose.translation)[None])
-    return bound(path, dict(zip(onnx.INPUTS, tensors, strict=True)))
+    state = onnx.first_state(model, pose)
+    names = (*onnx.STATE, *onnx_forces.DRAPE)[: len(state)]
+    given = dict(zip(names, state, strict=True)) | {x: np.asarray(getattr(pose, x))[None] for x in onnx.POSE}
+    return bound(path, given | ({"external": np.zeros((1, 3), np.float32)} if model.wearer.cloth else {}))
 
 
 def session_call(path: Path) -> Call:

@@ -14,7 +14,7 @@ from clothjax.training import laplacian_shapes, stage1
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 # what test_experiments.py trains, and the same program on other meshes; what test_baselines.py has; a large network
-LONG = ("quickstart", "pants", "skirt", "dress", "protocol", "ncs", "snug", "direct", "paper_tshirt")
+LONG = ("quickstart", "pants", "skirt", "dress", "protocol", "forces", "ncs", "snug", "direct", "paper_tshirt")
 
 
 @pytest.mark.parametrize(

