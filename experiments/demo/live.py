@@ -63,12 +63,22 @@ class Outfit:
             return np.asarray(self.model.faces), np.asarray(self.model.wearer.template).T
         return self._comparison.faces, np.asarray(self._character.template)
 
-    def psi(self, poses: list[Pose]) -> np.ndarray:
-        """Return vertices [N, V, 3] m of the next frame, for the characters' poses."""
+    @property
+    def feels_wind(self) -> bool:
+        """Whether the garment's Psi feels an acceleration beside gravity."""
+        return self.model.wearer.cloth is not None
+
+    def psi(self, poses: list[Pose], wind: np.ndarray) -> np.ndarray:
+        """Return vertices [N, V, 3] m of the next frame, for the characters' poses.
+
+        Args:
+            wind: [3] m/s^2, an acceleration of the cloth; not felt by every garment.
+        """
         together = Pose(*(jnp.asarray(np.stack(each)) for each in zip(*poses, strict=True)))
         if self._states is None:
             self._states = jax.vmap(lambda pose: inference.initial_state(self.model, pose))(together)
-        self._states, vertices = inference.step_crowd(self._crowd, self._states, together)
+        external = jnp.tile(jnp.asarray(wind, jnp.float32), (self.count, 1)) if self.feels_wind else None
+        self._states, vertices = inference.step_crowd(self._crowd, self._states, together, external)
         return np.asarray(vertices)
 
     def beside(self, stages: list[str], window: Pose) -> dict[str, np.ndarray]:
@@ -152,6 +162,7 @@ class Steering:
         self.gait, self.heading = 0, 0.0
         self.doing: str | None = None  # a family of clips ...
         self.until = 0  # ... up to this frame
+        self.wind = 0.0  # m/s^2, along x
 
     def faster(self) -> None:
         self.gait = min(self.gait + 1, len(SPEEDS) - 1)
@@ -223,7 +234,8 @@ class Show:
             for each, by in zip(poses[:BODIES], shift, strict=False)
         ]
         paused = time.perf_counter()
-        shown = {"psi": self.outfit.psi(poses) + shift[:, None]}
+        wind = np.array([steering.wind, 0.0, 0.0])
+        shown = {"psi": self.outfit.psi(poses, wind) + shift[:, None]}
         self.seconds = {"psi": time.perf_counter() - paused, "pose": paused - began}
         newest = [self.past[max(len(self.past) - 3 + i, 0)] for i in range(3)]
         window = Pose(*(np.stack(each) for each in zip(*newest, strict=True)))

@@ -5,8 +5,8 @@
     python -m experiments.demo runs/my_skirt --motions clips/*.motion.h5
 
 Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the
-arrows are the viewer's own, for its camera. The panel repeats the keys and chooses garment, body and cloth, and the
-stages beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
+arrows are the viewer's own, for its camera. The panel repeats the keys and chooses garment, body and cloth, wind for
+the skirt, and the stages beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
 """
 
 import argparse
@@ -82,6 +82,9 @@ class Viewer:
                 name: gui.add_slider(name.capitalize(), 0.0, 1.0, 0.01, round(share, 2))
                 for name, share in values.items()
             }
+            hint = "m/s^2 from the side; only garments with forces feel it, and only Psi"
+            self.wind = gui.add_slider("Wind", 0.0, 20.0, 0.5, 0.0, hint=hint, visible=show.outfit.feels_wind)
+            self.wind.on_update(lambda _: setattr(steering, "wind", float(self.wind.value)))
         with gui.add_folder("Show"):
             self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
             self.body = gui.add_checkbox("Body", True)
@@ -142,6 +145,7 @@ class Viewer:
         material = Material(*(unscaled(self.material[name].value, self.ranges[name]) for name in Material._fields))
         run = self.garments[self.garment.value]
         self.show.dress(run, betas, material, int(self.count.value), self.fine.value)
+        self.wind.visible = self.show.outfit.feels_wind
 
     def _remove_meshes(self) -> None:
         self._draw_anew = False

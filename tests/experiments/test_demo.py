@@ -135,6 +135,20 @@ def test_a_crowd_wears_what_is_chosen(clips):
         live.Show(clips._replace(fps=60.0), FAMILIES, SKIRT)
 
 
+def test_wind_blows_a_skirt_aside_but_no_garment_without_forces(clips):
+    aside = []
+    for wind in (0.0, 15.0):
+        show = live.Show(clips, FAMILIES, SKIRT)
+        show.steering.wind = wind
+        for _ in range(30):
+            garments, bodies = show.frame()
+        aside.append((garments["psi"][0].mean(axis=0) - bodies[0].mean(axis=0))[0])
+    assert 0.01 < aside[1] - aside[0] < 0.2
+    show.dress(TSHIRT)
+    calm = show.frame()[0]["psi"]
+    assert not show.outfit.feels_wind and np.isfinite(calm).all()
+
+
 @pytest.mark.parametrize("frames", [300, pytest.param(18000, marks=pytest.mark.slow, id="ten_minutes")])
 def test_random_steering_leaves_nothing_infinite(clips, frames):
     show, random = live.Show(clips, FAMILIES, DRESS), np.random.default_rng(0)
@@ -196,6 +210,14 @@ def test_the_panel_reaches_what_is_shown(viewer):
     viewer.run(1)
     large = skinning.shaped_vertices(storage.load_body("body"), jnp.asarray([2.0] + [0.0] * 9))
     np.testing.assert_allclose(viewer.show._shape[0], large, atol=1e-5)
+    assert viewer.wind.visible
+    viewer.wind.value = 5.0
+    assert viewer.show.steering.wind == 5.0
+    viewer.garment.value = "tshirt"
+    viewer.run(1)
+    assert not viewer.wind.visible
+    viewer.garment.value, viewer.wind.value = "skirt", 0.0
+    viewer.run(1)
     viewer.points.value, viewer.stages["skinning"].value, viewer.body.value = "strain", True, False
     viewer.run(2)
     assert set(viewer.meshes) == {
