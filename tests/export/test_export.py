@@ -410,7 +410,7 @@ def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 40)
     out = tmp_path / "s.onnx"
-    convert.main(["skirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
+    convert.main(["tshirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
     told = json.loads(out.with_suffix(".json").read_text())
     assert told["betas"] == [1.0] and 0 < told["distance_to_jax"]["mean_mm"] < 1
     assert "over 40 frames of autoregressive rollout" in capsys.readouterr().out

@@ -364,8 +364,8 @@ def frames(motion, path, count):
 
 def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 20)
-    out = tmp_path / "engine" / "skirt.psi"
-    convert.main(["skirt", "--to", "c", "--out", str(out)])
+    out = tmp_path / "engine" / "tshirt.psi"
+    convert.main(["tshirt", "--to", "c", "--out", str(out)])
     assert "over 20 frames of autoregressive rollout" in capsys.readouterr().out
     shutil.copy(PLAY, out.parent)
     program = out.parent / "play"
@@ -385,9 +385,9 @@ def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, cap
     done = subprocess.run([program, out, given, tmp_path / "vertices.bin"], check=True, capture_output=True, text=True)
     assert done.stdout.endswith("us a frame, one thread\n")
     found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(30, -1, 3)
-    skirt = rounded(specialise.specialise(cj.load("skirt")))
+    tshirt = rounded(specialise.specialise(cj.load("tshirt")))
     short = motion._replace(rotations=motion.rotations[:30], translation=motion.translation[:30])
-    assert apart(found, skirt, short).max() < 3e-5
+    assert apart(found, tshirt, short).max() < 3e-5
     for broken, why in ((given, "not a .psi of this version"), (tmp_path / "none.psi", "cannot be opened")):
         done = subprocess.run([program, broken, given, tmp_path / "v.bin"], capture_output=True, text=True)
         assert done.returncode == 1 and str(broken) in done.stderr and why in done.stderr
