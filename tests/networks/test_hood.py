@@ -119,6 +119,7 @@ def test_graph_and_masses_are_hoods(golden):
     np.testing.assert_allclose(garment.mass, golden["v_mass"], rtol=1e-6)  # HOOD rounds them to float32
 
 
+@pytest.mark.slow
 def test_three_steps_of_a_rollout_are_hoods(golden):
     """Of training: raw states in, statistics that grow from step to step, positions out."""
     garment = cloth(golden)._replace(mass=golden["v_mass"])

@@ -13,13 +13,10 @@ from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes, stage1
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
-# what test_experiments.py trains, and the same program on other meshes; what test_baselines.py has; a large network
-LONG = ("quickstart", "pants", "skirt", "dress", "protocol", "forces", "ncs", "snug", "direct", "paper_tshirt")
 
 
-@pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in LONG), id=p.stem) for p in CONFIGS]
-)
+@pytest.mark.slow  # test_experiments.py trains the quickstart, test_baselines.py the baselines
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_every_configuration_takes_two_steps(path):
     config = shrink(configuration.load(Config, path))
     config = dataclasses.replace(config, motions=("walk_0",))

@@ -166,6 +166,7 @@ def test_fewer_shapes_bear_eight_bits():
         assert jnp.linalg.norm(apart, axis=-1).mean() < 5e-4, count
 
 
+@pytest.mark.slow
 def test_an_equalised_model_is_the_same(wide, motion):
     clip = motion._replace(rotations=motion.rotations[:100], translation=motion.translation[:100])
     beside = random_model(skip=True)

@@ -109,6 +109,7 @@ def test_torn_or_sunken_cloth_is_not_ok_though_it_is_a_minimum():
     assert info.ok and info.depth == 0
 
 
+@pytest.mark.slow
 def test_self_contact_keeps_two_layers_apart():
     """A sheet falls on another that is pinned: it stays above it, and goes through without self-contact."""
     low, mesh = sheet()

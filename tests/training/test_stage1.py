@@ -106,6 +106,7 @@ def _play(experiment, reel, params, motion, advance_turn):
     return np.asarray(new), np.asarray(character.joints[0])
 
 
+@pytest.mark.slow
 def test_phi_does_not_see_place_or_heading(toy, update):
     experiment, reel = toy
     state = stage1.init(experiment.scene, reel, experiment.config)
