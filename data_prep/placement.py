@@ -19,6 +19,7 @@ TO_Y_UP = {axis: turn_upright(direction) for axis, direction in AXES.items()}
 MAX_MEAN_DISTANCE = 0.25  # m, from the body, of a garment that is around it
 QUARTERS = (0, 90, 180, 270)  # degrees
 INSIDE_PENALTY = 10  # weight of the depth inside the body over the distance to it, in comparing units
+ALIKE = 1.5  # times the least cost, up to which places fit alike
 ON_BODY = 0.003  # m, from the body, of an object that is the body
 BELOW = 0.02  # m, below the soles
 AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
@@ -60,7 +61,7 @@ def check_place(path: str | Path, vertices: np.ndarray, surface: Surface, place:
     size = np.ptp(vertices, axis=0)
     size_text = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {place.units}, {place.up.upper()} up"
     if cost.min() < np.inf:
-        meant = places[int(cost.argmin())]
+        meant = _likeliest(places, cost, place)
         flags = f"--units {meant.units} --up {meant.up}" + f" --turn {meant.turn:.0f}" * (meant.turn != place.turn)
         raise ValueError(f"{size_text}: that is not around the body. Is it meant to be {flags}?")
     raise ValueError(
@@ -120,6 +121,16 @@ def better_place(vertices: np.ndarray, surface: Surface, place: Placement) -> st
     flags = [f"--up {best.up}"] * (best.up != place.up) + [f"--turn {best.turn:.0f}"] * (best.turn != place.turn)
     flags += ["--shift " + " ".join(f"{x + 0.0:.2f}" for x in best.shift)] * (best.shift != place.shift)
     return f"It would be nearer with {' '.join(flags)}; "
+
+
+def _likeliest(places: list[Placement], cost: np.ndarray, place: Placement) -> Placement:
+    """Return, of the places that fit alike, by what they cost [P], the one that differs least from the user's."""
+
+    def key(number: int) -> tuple[int, float]:
+        it = places[number]
+        return 2 * (it.up != place.up) + (it.turn != place.turn) + (it.units != place.units), cost[number]
+
+    return places[min(np.flatnonzero(cost <= ALIKE * cost.min()), key=key)]
 
 
 def _fit(
