@@ -19,7 +19,7 @@ from clothjax.files.storage import save_body
 from clothjax.render import ray_cast
 from clothjax.types import Body, Motion
 from data_prep.character import Character, naming, nearest_rotations, read
-from data_prep.program import MotionOptions, Unit, run, write_motion
+from data_prep.program import OutputOptions, Unit, run, write_motion
 from data_prep.retarget import relative, stand
 
 STRETCHED = 0.01  # m, by which a joint may be elsewhere than the animation has it
@@ -65,7 +65,7 @@ def _motion(character: Character, number: int, fps: float) -> tuple[Motion | Non
 
 
 @dataclass(frozen=True)
-class Arguments(MotionOptions):
+class Arguments(OutputOptions):
     """Make a body, and its motions, of a rigged character in a glTF file."""
 
     character: tyro.conf.Positional[Path] = field(kw_only=False)

@@ -31,19 +31,25 @@ def run(main: Callable[[Any], None], arguments: type, description: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionOptions:
-    """Options of every program that retargets a recording onto a body."""
+class OutputOptions:
+    """Options of every program that writes motions."""
 
-    body: str = "body"
-    """File of the body, or the name of the embedded one."""
     fps: float = 30.0
     """Frames per second of the result."""
-    freeze: bool = True
-    """Keep hands, fingers and toes still."""
     bad: Bad = "keep"
     """Treatment of frames with a movement that no body can make: `keep` them, `repair` them by interpolation, or `drop`
     all but the longest stretch without any."""
     licence: str = "of the recording"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions(OutputOptions):
+    """Options of every program that retargets a recording onto a body."""
+
+    body: str = "body"
+    """File of the body, or the name of the embedded one."""
+    freeze: bool = True
+    """Keep hands, fingers and toes still."""
 
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -117,7 +123,7 @@ def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, reco
     )
 
 
-def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: MotionOptions) -> None:
+def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: OutputOptions) -> None:
     """Treat the implausible frames of a motion as asked, save it, and print which frames they are.
 
     Args:
