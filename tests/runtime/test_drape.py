@@ -111,8 +111,9 @@ def test_a_motion_is_animated_with_an_acceleration_for_each_frame(model, motion)
     assert np.abs(pushed[4] - calm[4]).max() > 1e-4
 
 
-def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_it(model, motion):
-    """A random network never does by itself."""
+def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_it(motion):
+    """A random network never does by itself. Its code is not clipped: a clipped change would not shrink."""
+    model = random_force_psi(limit=1e3).model()
     state, changes = inference.initial_state(model, pose(motion, 0)), []
     state = state._replace(drape=state.drape._replace(still=jnp.float32(0)))
     wind, stands, tilted = jnp.array([1e-3, 0.0, 0.0]), pose(motion, 0), None
@@ -120,7 +121,7 @@ def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_
     def change(state, pose, external=None):
         return float(jnp.abs(inference.step(model, state, pose, False, external)[0].drape.change).max())
 
-    for frame in range(250):
+    for frame in range(350):
         awake = state._replace(drape=state.drape._replace(still=jnp.float32(0)))
         free = change(awake, stands)
         before = state
