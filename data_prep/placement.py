@@ -19,7 +19,7 @@ TO_Y_UP = {axis: turn_upright(direction) for axis, direction in AXES.items()}
 MAX_MEAN_DISTANCE = 0.25  # m, from the body, of a garment that is around it
 QUARTERS = (0, 90, 180, 270)  # degrees
 INSIDE_PENALTY = 10  # weight of the depth inside the body over the distance to it, in comparing units
-ALIKE = 1.5  # times the least cost, up to which places fit alike
+ALIKE = 2.0  # times the least cost, up to which places fit alike
 ON_BODY = 0.003  # m, from the body, of an object that is the body
 BELOW = 0.02  # m, below the soles
 AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
@@ -124,11 +124,11 @@ def better_place(vertices: np.ndarray, surface: Surface, place: Placement) -> st
 
 
 def _likeliest(places: list[Placement], cost: np.ndarray, place: Placement) -> Placement:
-    """Return, of the places that fit alike, by what they cost [P], the one that differs least from the user's."""
+    """Return, of places that cost [P] alike, the one with the user's axes, or the one that costs least."""
 
-    def key(number: int) -> tuple[int, float]:
+    def key(number: int) -> tuple[bool, float]:
         it = places[number]
-        return 2 * (it.up != place.up) + (it.turn != place.turn) + (it.units != place.units), cost[number]
+        return (it.up, it.turn) != (place.up, place.turn), cost[number]
 
     return places[min(np.flatnonzero(cost <= ALIKE * cost.min()), key=key)]
 
