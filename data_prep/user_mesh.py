@@ -21,6 +21,7 @@ from data_prep.placement import Placement, Surface, better_place, check_objects,
 from data_prep.remesh import resample
 from data_prep.seams import WELD_DISTANCE, check_seams, sewn
 
+FAR = 0.12  # m, from the body in the middle, above which it is asked whether a garment is worn there
 LOOSE_DISTANCE = 0.03  # m; a garment with a larger median distance to the body counts as loose
 DEEP, MAX_DEEP_SHARE = 0.03, 0.15  # m inside the body; a larger share of such vertices means another body
 MIN_VERTICES, MAX_VERTICES = 100, 20_000
@@ -101,6 +102,8 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     working = working.logged(
         f"{'loose' if loose else 'tight'}: {1e3 * distance:.0f} mm from the body in the middle, so skin and "
         f"shape are those of the body {'around' if loose else 'nearest to'} each vertex"
+        + ": is it worn elsewhere?"
+        * (distance > FAR)
     )
     if at_place:
         pinned = marks.pinned_at(path, working.vertices, working.faces, answers.pin)
