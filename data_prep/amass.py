@@ -30,10 +30,8 @@ from data_prep.smpl import BODY
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 HIGHEST = 10.0  # m, of a pelvis whose path is in metres
 LARGEST = 4 * np.pi  # rad, of a turn that is not in degrees
-BENT, ONE_WAY = (
-    0.1,
-    0.5,
-)  # rad of knees and elbows on average, and the share of it in one direction, that show which way
+BENT = 0.1  # rad, of knees or elbows on average, that show which way these bend ...
+ONE_WAY = 0.5  # ... if this share of it is in one direction
 
 
 def read_amass(

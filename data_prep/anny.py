@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import igl
 import numpy as np
 import tyro
 
 from clothjax.files.storage import save_body
 from clothjax.geometry.topology import boundary_loops
 from clothjax.types import Body
+from data_prep.mesh import carried_over
 from data_prep.program import run
 from data_prep.rest_pose import to_t_pose
 from data_prep.skeleton import landmarks
@@ -153,18 +153,18 @@ def build(template: Template, vertices: int = 6890, betas: int = 10, people: int
     coarse, triangles = fast_simplification.simplify(
         skin.astype(np.float32), faces.astype(np.int32), target_count=2 * vertices, agg=5
     )
-    _, face, foot = igl.point_mesh_squared_distance(coarse.astype(np.float64), skin, faces.astype(np.int64))[:3]
-    corners = faces[face]
-    share = igl.barycentric_coordinates(foot, *(np.ascontiguousarray(skin[c]) for c in corners.T))
-    weights = np.einsum("vk,vkj->vj", share, template.weights[used][corners])
+    points, faces = coarse.astype(np.float64), faces.astype(np.int64)
+    weights, vertices, shapedirs = (
+        carried_over(points, skin, faces, values) for values in (template.weights[used], skin, directions[: len(used)])
+    )
     weights = np.where(weights > 1e-3, weights, 0)
     return Body(
-        vertices=np.einsum("vk,vkc->vc", share, skin[corners]).astype(np.float32),
+        vertices=vertices.astype(np.float32),
         faces=triangles.astype(np.int32),
         joints=joints.astype(np.float32),
         parents=template.parents.astype(np.int32),
         weights=(weights / weights.sum(axis=1, keepdims=True)).astype(np.float32),
-        shapedirs=np.einsum("vk,vkcs->vcs", share, directions[: len(used)][corners]).astype(np.float32),
+        shapedirs=shapedirs.astype(np.float32),
         joint_shapedirs=directions[len(used) :].astype(np.float32),
     )
 

@@ -4,23 +4,21 @@ A file does not say which way the character faces, its unit, or which joint is w
 the names. A mesh of several objects, with openings or with clothes on is wrapped in one closed surface.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import igl
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from clothjax.files.damage import UNREADABLE
 from clothjax.files.storage import Rig
 from clothjax.types import Body
 from data_prep import skeleton
-from data_prep.gltf_file import Document, Part, parts
+from data_prep.gltf_file import Document, Part, naming, parts
+from data_prep.gltf_skeleton import bind_places, distinct_names, humanoid, known_names, to_world
+from data_prep.mesh import carried_over
 from data_prep.program import METRES, Unit, known_parts
 from data_prep.rest_pose import AXES, to_t_pose, unit
-from data_prep.wrap import VERTICES, carried_over, is_closed, wrap
+from data_prep.wrap import VERTICES, is_closed, wrap
 
 TALL = (1.0, 2.3)  # m, of a figure whose unit of length is looked for
 FARTHEST = 2.5  # m, of a vertex from the hips
@@ -28,12 +26,6 @@ WELD = 1e-5  # m, within which vertices are one: files split them where textures
 MOST_FACES = 30_000  # of a body as it is; contact is sought on every one
 MOVED = 0.005  # m, by which a morph target moves the trunk or a limb at least to be a shape of the body
 FULL = 3.0  # betas at which a morph target is taken in full
-VRM_LIMBS = ("Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes")  # bones of VRM
-VRM = {part: part for part in skeleton.MIDDLE} | {
-    f"{side}{bone}": f"{side} {part}"
-    for side in skeleton.SIDES
-    for bone, part in zip(VRM_LIMBS, (*skeleton.ARM, *skeleton.LEG), strict=True)
-}
 
 
 class Bound(NamedTuple):
@@ -115,17 +107,6 @@ def read(
     return Character(Rig(body, bound.names), canonical, document, bound, upright, (*log, *told, *wrapped))
 
 
-@contextmanager
-def naming(path: str | Path) -> Iterator[None]:
-    """Raise whatever damage to a file raises as a ValueError that names it."""
-    try:
-        yield
-    except UNREADABLE as error:
-        detail = error if isinstance(error, ValueError) else f"damaged, or not glTF: {type(error).__name__} {error}"
-        prefix = "" if str(detail).startswith(str(path)) else f"{path}: "
-        raise ValueError(f"{prefix}{detail}") from error
-
-
 def _chosen(skinned: list[Part], objects: tuple[str, ...]) -> list[Part]:
     """Return the parts that have one of some names, all if none is given."""
     names = dict.fromkeys(name for part in skinned for name in part.names)
@@ -164,7 +145,7 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
     for part in chosen:
         assert part.skinned is not None
         skin, count = document.entries("skins")[part.skinned.skin], len(part.vertices)
-        to_world = _to_world(document, part.skinned.skin, nodes, places)
+        mesh_to_world = to_world(document, part.skinned.skin, nodes, places)
         columns = np.array([number.get(joint, 0) for joint in skin["joints"]])[part.skinned.joints]
         elsewhere = np.array([joint not in number for joint in skin["joints"]])[part.skinned.joints]
         outside += int(((part.skinned.weights * elsewhere).sum(axis=1) > 0.01).sum())
@@ -172,9 +153,9 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
         np.add.at(own, (np.arange(count)[:, None], columns), part.skinned.weights)
         own[own.sum(axis=1) == 0, 0] = 1.0
         faces.append(part.faces + sum(map(len, vertices)))
-        vertices.append(part.skinned.bound @ to_world[:3, :3].T + to_world[:3, 3])
+        vertices.append(part.skinned.bound @ mesh_to_world[:3, :3].T + mesh_to_world[:3, 3])
         weights.append(own)
-        moves.append({name: added @ to_world[:3, :3].T for name, added in part.morphs.items()})
+        moves.append({name: added @ mesh_to_world[:3, :3].T for name, added in part.morphs.items()})
     if outside:
         log.append(f"{outside} vertices follow joints that do not hang on the hips: they follow the hips")
     vertices, faces, weights = (np.concatenate(each) for each in (vertices, faces, weights))
@@ -208,76 +189,9 @@ def _skeleton(
         of_body = skeleton.told(said, names, parents, "its VRM humanoid")
     else:
         of_body = known_parts(names, parents, joints, document.path)
-    known = _known_names(names, parents, of_body)
+    known = known_names(names, parents, of_body)
     log = [f"joint {old} is called {new}" for old, new in zip(names, known, strict=True) if old != new]
     return known, parents, of_body, log
-
-
-def distinct_names(names: list[str]) -> tuple[str, ...]:
-    """Return names of which no two are the same."""
-    return tuple(name if names.index(name) == k else f"{name} {k}" for k, name in enumerate(names))
-
-
-def humanoid(document: Document) -> dict[str, int]:
-    """Return the nodes of the parts of a VRM character of version 0 or 1, or of a VRM animation; nothing for others."""
-    extensions = document.json.get("extensions", {})
-    new = extensions.get("VRMC_vrm", extensions.get("VRMC_vrm_animation", {})).get("humanoid", {}).get("humanBones", {})
-    old = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
-    bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
-    return {VRM[name]: node for name, node in bones.items() if name in VRM}
-
-
-def _known_names(names: tuple[str, ...], parents: np.ndarray, of_body: skeleton.Parts) -> tuple[str, ...]:
-    """Return names by which the parts of a body are found again: its own, or CMU's where they are of no scheme."""
-    try:
-        if skeleton.find(names, parents) == of_body:
-            return names
-    except ValueError:
-        pass
-    renamed = {of_body.hips: "Hips", of_body.chain[-1]: "Head"}
-    renamed |= {joint: skeleton.cmu_name(part) for part, joint in of_body.limbs.items()}
-    taken = set(renamed.values())
-    return tuple(renamed.get(j, f"{name} of the file" if name in taken else name) for j, name in enumerate(names))
-
-
-def bind_places(document: Document, scene: dict, nodes: list[int], parents: np.ndarray, skin: int) -> np.ndarray:
-    """Return the matrices [J, 4, 4] of the joints in the pose in which a skin was bound to them.
-
-    The scene may show another pose. Then the first joint's turn, to whole quarters, says how the mesh's axes lie.
-    """
-    inverse = document.inverse_bind(skin)
-    if inverse is None:
-        return np.stack([scene[node] for node in nodes])
-    own = dict(zip(document.entries("skins")[skin]["joints"], np.linalg.inv(inverse), strict=True))
-    first = next(node for node in nodes if node in own)
-    to_world = scene[first] @ np.linalg.inv(own[first])
-    if not all(np.allclose(scene[node], to_world @ own[node], atol=1e-3) for node in own):
-        turn = nearest_rotations(to_world[:3, :3])
-        quarters = Rotation.create_group("O").as_matrix()
-        quarter = quarters[np.argmax(np.einsum("ab,nab->n", turn, quarters))]
-        to_world[:3, :3] = quarter @ turn.T @ to_world[:3, :3]
-    places = np.zeros((len(nodes), 4, 4))
-    for j, node in enumerate(nodes):
-        if node in own:
-            places[j] = to_world @ own[node]
-        elif parents[j] >= 0:
-            above = scene[nodes[parents[j]]]
-            places[j] = places[parents[j]] @ np.linalg.inv(above) @ scene[node]
-        else:
-            places[j] = scene[node]
-    return places
-
-
-def _to_world(document: Document, skin: int, nodes: list[int], places: np.ndarray) -> np.ndarray:
-    """Return the matrix [4, 4] from the mesh of a skin to the world, in which it was bound."""
-    inverse, joints = document.inverse_bind(skin), document.entries("skins")[skin]["joints"]
-    return np.eye(4) if inverse is None else places[nodes.index(joints[0])] @ inverse[0]
-
-
-def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
-    """Return the rotations [..., 3, 3] nearest to matrices that may scale."""
-    left, _, right = np.linalg.svd(matrices)
-    return left @ right
 
 
 def _upright(bound: Bound, of_body: skeleton.Parts, units: Unit | None) -> tuple[Upright, list[str]]:

@@ -19,7 +19,7 @@ from clothjax.files.storage import load_rig, save_garment
 from clothjax.render import ray_cast
 from clothjax.types import Body, Garment
 from data_prep.placement import Placement
-from data_prep.program import Axis, Unit, run
+from data_prep.program import Axis, Unit, draw, run
 from data_prep.templates import build
 from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, bring
 
@@ -113,11 +113,11 @@ def main(args: Arguments) -> None:
         licence=args.licence,
     )
     if args.mesh is not None:
-        draw(args.output.with_suffix(".garment.png"), garment, body)
+        picture(args.output.with_suffix(".garment.png"), garment, body)
     print(f"{args.output}: {len(garment.vertices)} vertices, {int(garment.pinned.sum())} pinned")
 
 
-def draw(path: str | Path, garment: Garment, body: Body) -> None:
+def picture(path: str | Path, garment: Garment, body: Body) -> None:
     """Draw the garment on the body from four sides, pinned vertices as red dots; needs the extra `render`."""
     surfaces = [
         ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN),
@@ -129,14 +129,9 @@ def draw(path: str | Path, garment: Garment, body: Body) -> None:
         dots = (places[:, None] + np.asarray(dot.vertices)[None]).reshape(-1, 3)
         faces = (len(dot.vertices) * np.arange(len(places))[:, None, None] + np.asarray(dot.faces)[None]).reshape(-1, 3)
         surfaces.append(ray_cast.Surface(dots, faces, PIN_COLOUR))
-    views = ("front", "three-quarter", "side", "back")
-    try:
-        size = np.ptp(garment.vertices, axis=0)
-        margin = 1.2 * max(1.0, 4 / 3 * size[[0, 2]].max() / size[1])
-        pictures = [ray_cast.render(surfaces, ray_cast.camera_for(garment.vertices, view, margin)) for view in views]
-        ray_cast.comparison(path, {"": pictures}, views)
-    except ImportError as error:
-        print(f"{path}: not drawn ({error})")
+    size = np.ptp(garment.vertices, axis=0)
+    margin = 1.2 * max(1.0, 4 / 3 * size[[0, 2]].max() / size[1])
+    draw(Path(path), surfaces, garment.vertices, margin)
 
 
 if __name__ == "__main__":

@@ -17,9 +17,11 @@ import tyro
 from clothjax.body.plausibility import joint_positions
 from clothjax.files.storage import save_body
 from clothjax.render import ray_cast
-from clothjax.types import Body, Motion
-from data_prep.character import Character, naming, nearest_rotations, read
-from data_prep.program import OutputOptions, Unit, run, write_motion
+from clothjax.types import Motion
+from data_prep.character import Character, read
+from data_prep.gltf_file import naming
+from data_prep.gltf_skeleton import nearest_rotations
+from data_prep.program import OutputOptions, Unit, draw, run, write_motion
 from data_prep.retarget import relative, stand
 
 STRETCHED = 0.01  # m, by which a joint may be elsewhere than the animation has it
@@ -98,23 +100,13 @@ def main(args: Arguments) -> None:
     print("\n".join(f"{args.character}: {line}" for line in character.log))
     shapes = body.shapedirs.shape[-1]
     print(f"{args.output}: {len(body.vertices)} vertices, {len(names)} joints, {shapes} shape parameters")
-    draw(args.output.with_suffix(".body.png"), body)
+    surface = ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN)
+    draw(args.output.with_suffix(".body.png"), [surface], np.asarray(body.vertices), 1.2)
     if args.motions is not None:
         found, log = motions(character, args.fps)
         print("\n".join(f"{args.character}: {line}" for line in log or [f"{len(found)} animations"]))
         for name, motion in found.items():
             write_motion(args.motions / f"{name}.h5", motion, character.rig, Path(name), args)
-
-
-def draw(path: Path, body: Body) -> None:
-    """Draw a body from four sides; needs the extra `render`."""
-    views = ("front", "three-quarter", "side", "back")
-    surface = ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN)
-    try:
-        pictures = [ray_cast.render([surface], ray_cast.camera_for(body.vertices, view, 1.2)) for view in views]
-        ray_cast.comparison(path, {"": pictures}, views)
-    except ImportError as error:
-        print(f"{path}: not drawn ({error})")
 
 
 if __name__ == "__main__":

@@ -6,11 +6,15 @@ Read are nodes, skins, default morph weights, sparse and normalised accessors. W
 import base64
 import json
 import urllib.parse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
+
+from clothjax.files.damage import UNREADABLE
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -42,6 +46,17 @@ class Part(NamedTuple):
     morphs: dict[str, np.ndarray]  # [V, 3] by name, as the mesh has them
 
 
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Raise whatever damage to a file raises as a ValueError that names it."""
+    try:
+        yield
+    except UNREADABLE as error:
+        detail = error if isinstance(error, ValueError) else f"damaged, or not glTF: {type(error).__name__} {error}"
+        prefix = "" if str(detail).startswith(str(path)) else f"{path}: "
+        raise ValueError(f"{prefix}{detail}") from error
+
+
 class Document:
     """A glTF file, with its binary data.
 
@@ -49,7 +64,7 @@ class Document:
         path: of the file.
 
     Raises:
-        ValueError: naming the file, if it is damaged, or needs an extension that is not read.
+        ValueError: if it needs an extension that is not read; whatever damage raises (see `naming`).
     """
 
     def __init__(self, path: str | Path):

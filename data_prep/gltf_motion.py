@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
 from data_prep import skeleton
-from data_prep.character import bind_places, distinct_names, humanoid, naming, nearest_rotations
-from data_prep.gltf_file import Document
+from data_prep.gltf_file import Document, naming
+from data_prep.gltf_skeleton import bind_places, distinct_names, humanoid, nearest_rotations
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
 from data_prep.recording import Capture
 from data_prep.retarget import relative
@@ -54,12 +53,10 @@ def _capture(document: Document, number: int, fps: float) -> Capture:
     if root is None:
         raise ValueError("it turns no node")
     nodes, names, parents = _hanging_on(document, root)
-    parts = None
     with suppress(ValueError):  # of names that a mapping file explains
         # what is above the hips carries them, and has no part in the pose
         nodes, names, parents = _hanging_on(document, nodes[skeleton.find(names, parents).hips])
-        parts = skeleton.find(names, parents)
-    moved = document.moved(number, fps, {*nodes, *document.above(root)})
+    moved = document.moved(number, fps, {*nodes, *document.above(nodes[0])})
     world = np.stack([moved[node] for node in nodes], axis=1)
     skin = next((k for k, each in enumerate(document.entries("skins")) if nodes[0] in each["joints"]), None)
     rest = np.stack([scene[node] for node in nodes])
@@ -67,16 +64,7 @@ def _capture(document: Document, number: int, fps: float) -> Capture:
         rest = bind_places(document, scene, nodes, parents, skin)
     turns = nearest_rotations(world[..., :3, :3]) @ nearest_rotations(rest[:, :3, :3]).swapaxes(-1, -2)
     offsets = np.concatenate([np.zeros((1, 3)), rest[1:, :3, 3] - rest[parents[1:], :3, 3]])
-    turn = np.eye(3) if parts is None else _to_the_front(rest[:, :3, 3], parts)
-    turns, offsets, path = turn @ turns @ turn.T, offsets @ turn.T, world[:, 0, :3, 3] @ turn.T
-    return Capture(names, parents, offsets, relative(turns, parents), path, fps)
-
-
-def _to_the_front(rest: np.ndarray, parts: skeleton.Parts) -> np.ndarray:
-    """Return the quarter turns [3, 3] about +y that make a figure face +z, of joints [n, 3] in its rest pose."""
-    left = rest[parts.limbs["left thigh"]] - rest[parts.limbs["right thigh"]]
-    quarters = np.round(np.arctan2(left[2], left[0]) / (0.5 * np.pi))
-    return Rotation.from_euler("y", 90.0 * quarters, degrees=True).as_matrix()
+    return Capture(names, parents, offsets, relative(turns, parents), world[:, 0, :3, 3], fps)
 
 
 def _hanging_on(document: Document, root: int) -> tuple[list[int], tuple[str, ...], np.ndarray]:

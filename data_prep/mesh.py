@@ -1,5 +1,6 @@
-"""Plain operations on triangle meshes: edges, connected parts, cutting."""
+"""Plain operations on triangle meshes: edges, connected parts, cutting, the surface of a field."""
 
+import igl
 import numpy as np
 
 from clothjax.geometry.topology import components
@@ -59,3 +60,19 @@ def clip(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> tuple
         x, y = cut[min(a, b), max(a, b)], cut[min(a, c), max(a, c)]
         triangles += [[a, x, y]] if within.sum() == 1 else [[b, c, y], [b, y, x]]
     return compact(vertices, np.array(triangles, int).reshape(-1, 3))
+
+
+def zero_set(places: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface on which a field [X, Y, Z], given at places [X, Y, Z, 3] of a grid, is zero."""
+    values = np.ascontiguousarray(field.transpose(2, 1, 0)).reshape(-1)  # x runs fastest, as igl wants it
+    corners = np.ascontiguousarray(places.transpose(2, 1, 0, 3)).reshape(-1, 3)
+    return igl.marching_cubes(values, corners, *field.shape, 0.0)[:2]
+
+
+def carried_over(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return at points [P, 3] the values [V, ...] of the nearest place on a mesh, [P, ...]."""
+    _, face, foot = igl.point_mesh_squared_distance(points, vertices, faces)
+    corners = [np.ascontiguousarray(vertices[faces[face, k]]) for k in range(3)]
+    shares = np.clip(igl.barycentric_coordinates(foot, *corners), 0.0, 1.0)
+    shares /= shares.sum(axis=1, keepdims=True)
+    return np.einsum("pk,pk...->p...", shares, values[faces[face]])

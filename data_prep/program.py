@@ -1,4 +1,4 @@
-"""Shared parts of the programs: the command line, and the options and output of those that retarget a recording."""
+"""Shared parts of the programs: the command line, pictures, and the options and output of those that write motions."""
 
 import sys
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import numpy as np
 
 from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
+from clothjax.render import ray_cast
 from clothjax.types import Motion
 from data_prep import skeleton
 from data_prep.doubts import doubts
@@ -121,6 +122,22 @@ def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, reco
         about=str(recording),
         tell=lambda line: print(f"{recording}: {line}"),
     )
+
+
+def draw(path: Path, surfaces: list[ray_cast.Surface], around: np.ndarray, margin: float) -> None:
+    """Draw surfaces from four sides, or say what is not installed.
+
+    Args:
+        path: of the picture.
+        surfaces: what is drawn.
+        around: [V, 3] m, which each picture has in its middle, with a margin.
+    """
+    views = ("front", "three-quarter", "side", "back")
+    try:
+        pictures = [ray_cast.render(surfaces, ray_cast.camera_for(around, view, margin)) for view in views]
+        ray_cast.comparison(path, {"": pictures}, views)
+    except ImportError as error:
+        print(f"{path}: not drawn ({error})")
 
 
 def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: OutputOptions) -> None:

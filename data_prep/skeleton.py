@@ -12,35 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
-CMU_FROM_SMPL = {
-    "pelvis": "Hips",
-    "spine1": "LowerBack",
-    "spine2": "Spine",
-    "spine3": "Spine1",
-    "neck": "Neck",
-    "head": "Head",
-    "left_collar": "LeftShoulder",
-    "left_shoulder": "LeftArm",
-    "left_elbow": "LeftForeArm",
-    "left_wrist": "LeftHand",
-    "left_hip": "LeftUpLeg",
-    "left_knee": "LeftLeg",
-    "left_ankle": "LeftFoot",
-    "left_foot": "LeftToeBase",
-    "right_collar": "RightShoulder",
-    "right_shoulder": "RightArm",
-    "right_elbow": "RightForeArm",
-    "right_wrist": "RightHand",
-    "right_hip": "RightUpLeg",
-    "right_knee": "RightLeg",
-    "right_ankle": "RightFoot",
-    "right_foot": "RightToeBase",
-}
-SIDES = ("left", "right")
-ARM, LEG = ("clavicle", "upper arm", "forearm", "hand"), ("thigh", "shin", "foot", "toe")
+from clothjax.body.joint_names import CMU_FROM_SMPL, LIMBS, SIDES
+
+ARM, LEG = tuple(LIMBS)[:4], tuple(LIMBS)[4:]
 SIDED = tuple(f"{side} {part}" for side in SIDES for part in (*ARM, *LEG))
 MIDDLE = ("hips", "neck", "head")
-CMU_LIMBS = dict(zip((*ARM, *LEG), ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")))
 NEEDED = ("upper arm", "forearm", "thigh", "shin", "foot")  # of either side; and hips, neck or head
 ARMS = (  # names of ARM by scheme, without side and separators
     ("shoulder", "arm", "forearm", "hand"),
@@ -84,7 +60,7 @@ def cmu_names(names: tuple[str, ...]) -> tuple[str, ...]:
 def cmu_name(part: str) -> str:
     """Return CMU's name of the joint of a part, such as `LeftForeArm` of `left forearm`."""
     side, _, own = part.partition(" ")
-    return side.capitalize() + CMU_LIMBS.get(own, "")
+    return side.capitalize() + (LIMBS[own][0] if own else "")
 
 
 def landmarks(names: tuple[str, ...], parents: np.ndarray) -> dict[str, int]:

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
 from data_prep.dressing import WINDING, clear_vertices, dress, highest_opening, limbs, push_out
-from data_prep.mesh import clip, component
+from data_prep.mesh import clip, component, zero_set
 from data_prep.remesh import flip, relax, resample
 from data_prep.skeleton import landmarks
 
@@ -175,10 +175,7 @@ def _solid(kind: Template, marks: Landmarks) -> tuple[np.ndarray, np.ndarray]:
         if kind.hull:
             field = np.minimum(field, _hanging(kind, marks, grid, hem))
     field = gaussian_filter(np.clip(field, -0.05, 0.05), kind.blur)
-    values = np.ascontiguousarray(field.transpose(2, 1, 0)).reshape(-1)  # x runs fastest, as igl wants it
-    places = np.ascontiguousarray(points.transpose(2, 1, 0, 3)).reshape(-1, 3)
-    vertices, faces = igl.marching_cubes(values, places, *grid.shape, 0.0)[:2]
-    return component(vertices, faces, marks.joint["Hips" if kind.waist else "LowerBack"])
+    return component(*zero_set(points, field), marks.joint["Hips" if kind.waist else "LowerBack"])
 
 
 def _closed(field: np.ndarray, radius: float) -> np.ndarray:

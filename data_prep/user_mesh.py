@@ -99,11 +99,10 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     working = working.logged(worn(working.vertices, working.faces, body))
     distance = float(np.median(np.abs(igl.signed_distance(working.vertices, *surface, sign_type=WINDING)[0])))
     loose = distance > LOOSE_DISTANCE if answers.loose is None else answers.loose
+    doubt = ": is it worn elsewhere?" if distance > FAR else ""
     working = working.logged(
         f"{'loose' if loose else 'tight'}: {1e3 * distance:.0f} mm from the body in the middle, so skin and "
-        f"shape are those of the body {'around' if loose else 'nearest to'} each vertex"
-        + ": is it worn elsewhere?"
-        * (distance > FAR)
+        f"shape are those of the body {'around' if loose else 'nearest to'} each vertex{doubt}"
     )
     if at_place:
         pinned = marks.pinned_at(path, working.vertices, working.faces, answers.pin)

@@ -6,7 +6,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from data_prep.dressing import WINDING
-from data_prep.mesh import compact, components
+from data_prep.mesh import compact, components, zero_set
 
 CELL = 0.008  # m, of the grid on which a surface is found
 BLOCK = 4  # cells, on whose middle it is looked for first
@@ -45,9 +45,7 @@ def wrap(vertices: np.ndarray, faces: np.ndarray, count: int = VERTICES) -> tupl
     places, field = _field(vertices, faces)
     if field.min() > -CELL:
         raise ValueError("its triangles enclose no body: which objects are the body (--object)?")
-    values = np.ascontiguousarray(gaussian_filter(field, 0.6).transpose(2, 1, 0)).reshape(-1)  # x runs fastest for igl
-    corners = np.ascontiguousarray(places.transpose(2, 1, 0, 3)).reshape(-1, 3)
-    surface, triangles = igl.marching_cubes(values, corners, *field.shape, 0.0)[:2]
+    surface, triangles = zero_set(places, gaussian_filter(field, 0.6))
     if trimesh.Trimesh(surface, triangles, process=False).volume < 0:
         triangles = triangles[:, ::-1]
     a, b, c = surface[triangles].swapaxes(0, 1)
@@ -86,12 +84,3 @@ def _field(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _spread(values: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     """Return the value of its block at every place of a grid."""
     return np.kron(values.reshape(blocks), np.ones((BLOCK,) * 3, values.dtype))
-
-
-def carried_over(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return at points [P, 3] the values [V, ...] of the nearest place on a mesh, [P, ...]."""
-    _, face, foot = igl.point_mesh_squared_distance(points, vertices, faces)
-    corners = [np.ascontiguousarray(vertices[faces[face, k]]) for k in range(3)]
-    shares = np.clip(igl.barycentric_coordinates(foot, *corners), 0.0, 1.0)
-    shares /= shares.sum(axis=1, keepdims=True)
-    return np.einsum("pk,pk...->p...", shares, values[faces[face]])

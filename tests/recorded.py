@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from clothjax.body.joint_names import CMU_FROM_SMPL
 from clothjax.body.plausibility import body_kinematics, kinematics
 from clothjax.files import storage
 from clothjax.types import Motion
 from data_prep import procedural
-from data_prep.skeleton import CMU_FROM_SMPL
 from data_prep.smpl import BODY
 
 FINE = 600  # Hz, of which every usual rate is a part

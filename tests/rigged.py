@@ -84,6 +84,7 @@ def write(
     extensions: dict | None = None,
     shown: int | None = None,
     ends: bool = False,
+    carriers: int = 0,
     skinned: bool = True,
 ) -> None:
     """Write a character with one animation.
@@ -98,6 +99,7 @@ def write(
         morphs: [V, 3] m by name.
         extensions: of the document; for VRM.
         ends: whether a far joint that moves nothing hangs on every last one, as importers of FBX leave them.
+        carriers: how many nodes, of which the first has keys, lie between that node and the hips.
         skinned: False for an animation alone.
         shown: frame of the motion in whose pose the scene stands; default: the canonical one.
     """
@@ -134,8 +136,12 @@ def write(
         skin.append(len(nodes))
         inverse = np.concatenate([inverse, inverse[j : j + 1]])
         nodes.append({"name": f"{names[j]}_end", "translation": [0.0, 700.0, 0.0]})
+    top = 0
+    for k in reversed(range(carriers)):
+        nodes.append({"name": "root" if k == 0 else f"carrier_{k}", "children": [top]})
+        top = len(nodes) - 1
     carrying = len(nodes)
-    nodes.append({"name": "Armature", "matrix": carrier.T.reshape(-1).tolist(), "children": [0]})
+    nodes.append({"name": "Armature", "matrix": carrier.T.reshape(-1).tolist(), "children": [top]})
     weights = np.sort(np.asarray(body.weights), axis=1)[:, :-5:-1]
     joints = np.argsort(np.asarray(body.weights), axis=1)[:, :-5:-1]
     attributes = {
@@ -156,6 +162,8 @@ def write(
     quaternions = quaternions.as_quat().reshape(len(positions), count, 4)
     outputs = [(j, "rotation", writer.add(quaternions[:, j])) for j in range(count)]
     outputs.append((0, "translation", writer.add(moving[:, 0, :3, 3])))
+    if carriers:
+        outputs.append((top, "rotation", writer.add(np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1)))))
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.body import skinning
+from clothjax.body import joint_names, skinning
 from clothjax.evaluation import rollouts
 from clothjax.evaluation.rollouts import Tracks, load_run, psi_trajectory, windows
 from clothjax.networks.animators import phi_animator
@@ -116,7 +116,8 @@ def perform_skinned(
         SkinnedPart("garment", np.asarray(cloth), np.asarray(experiment.garment.faces), weights, CLOTH),
     )
     parts = parts if experiment.scene.touchable else parts[1:]
-    return SkinnedPerformance(parts, experiment.names, np.asarray(body.parents), np.asarray(joints), clip)
+    bones = joint_names.vrm_bones(experiment.names)
+    return SkinnedPerformance(parts, experiment.names, np.asarray(body.parents), np.asarray(joints), bones, clip)
 
 
 def _unskinned(body: Body, joints: Array, weights: np.ndarray) -> Callable:

@@ -45,4 +45,5 @@ class SkinnedPerformance(NamedTuple):
     names: tuple[str, ...]  # [J] of the joints
     parents: np.ndarray  # [J] integers, root -1
     joints: np.ndarray  # [J, 3] m in the canonical pose
+    bones: dict[str, str]  # of VRM's humanoid, by the names of joints
     motion: Motion | None  # of T frames; None: the canonical pose alone

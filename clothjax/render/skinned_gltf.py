@@ -11,30 +11,6 @@ from clothjax.types import Array
 
 SET = 4  # joints that a set of attributes holds
 LOST = 0.01  # of a vertex's weights, above which a second set is written
-MIDDLE = {  # bones of VRM 1.0: the joints of CMU and of SMPL
-    "hips": ("Hips", "pelvis"),
-    "spine": ("LowerBack", "spine1"),
-    "chest": ("Spine", "spine2"),
-    "upperChest": ("Spine1", "spine3"),
-    "neck": ("Neck", "neck"),
-    "head": ("Head", "head"),
-}
-SIDED = {  # the same after a side, as in leftShoulder: LeftShoulder, left_collar
-    "Shoulder": ("Shoulder", "collar"),
-    "UpperArm": ("Arm", "shoulder"),
-    "LowerArm": ("ForeArm", "elbow"),
-    "Hand": ("Hand", "wrist"),
-    "UpperLeg": ("UpLeg", "hip"),
-    "LowerLeg": ("Leg", "knee"),
-    "Foot": ("Foot", "ankle"),
-    "Toes": ("ToeBase", "foot"),
-}
-HUMANOID = {joint: bone for bone, joints in MIDDLE.items() for joint in joints} | {
-    joint: f"{side}{bone}"
-    for bone, (cmu, smpl) in SIDED.items()
-    for side in ("left", "right")
-    for joint in (f"{side.title()}{cmu}", f"{side}_{smpl}")
-}
 
 
 def to_skinned_glb(
@@ -57,7 +33,7 @@ def to_skinned_glb(
             name=name,
             translation=rest[joint].tolist(),
             children=np.flatnonzero(parents == joint).tolist(),  # joints are the first nodes
-            extras={"humanoid": HUMANOID[name]} if name in HUMANOID else {},
+            extras={"humanoid": performance.bones[name]} if name in performance.bones else {},
         )
         for joint, name in enumerate(performance.names)
     ]

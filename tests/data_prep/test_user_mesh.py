@@ -399,3 +399,14 @@ def test_a_file_with_the_body_in_it_asks_for_the_garment(skirt, body, names, tmp
     assert len(made.vertices) == len(skirt[0])
     with pytest.raises(ValueError, match=r"no object 'hat'; there are"):
         bring(tmp_path / "dressed.glb", body, names, Answers(objects=("hat",)))
+
+
+@pytest.mark.parametrize("wide, asked", [(1.0, False), (1.6, True)])
+def test_a_garment_far_from_the_body_is_asked_about(wide, asked, body, names, tmp_path):
+    skirt = storage.load_garment("skirt_1000", body)
+    middle = skirt.vertices.mean(axis=0)
+    trimesh.Trimesh(middle + (skirt.vertices - middle) * [wide, 1, wide], skirt.faces, process=False).export(
+        tmp_path / "skirt.obj"
+    )
+    _, log = bring(tmp_path / "skirt.obj", body, names, Answers(pin="highest"))
+    assert any("in the middle" in line and "is it worn elsewhere?" in line for line in log) == asked

@@ -227,8 +227,9 @@ def test_c_shows_what_is_outside_of_the_planes_that_jax_feels(forced, name, high
     assert touched > 100 and beyond > 20
 
 
-@pytest.mark.parametrize("moved, share", [(0.0, 0.95**15), (1e-3, 1.0)])
-def test_c_with_forces_comes_to_rest_as_the_model(forced, moved, share, motion):
+@pytest.mark.parametrize("moved", [0.0, 2e-5, 4e-5])
+def test_c_with_forces_comes_to_rest_as_the_model(forced, moved, motion):
+    """What it stands still for, and by how much it then slows down, are constants of both."""
     if not psi_ffi.available():
         pytest.skip("needs a C++ compiler")
     model = of_eight_bits(forced["skip"])
@@ -240,9 +241,11 @@ def test_c_with_forces_comes_to_rest_as_the_model(forced, moved, share, motion):
     low, high, _ = model.network.code_bounds
     inside = (free.latent > low) & (free.latent < high) & (free.drape.change != 0.0)
     assert inside.sum() > 15
+    stands = moved < drape.STILL
+    share = drape.SLOWING ** (75 - drape.AWAKE) if stands else 1.0
     free, slowed = free.drape, slowed.drape
     np.testing.assert_allclose(slowed.change[inside], share * free.change[inside], rtol=1e-3, atol=1e-6)
-    assert (float(free.still), float(slowed.still)) == ((1.0, 75.0) if moved == 0.0 else (0.0, 0.0))
+    assert (float(free.still), float(slowed.still)) == ((1.0, 75.0) if stands else (0.0, 0.0))
     wind = psi_ffi.step(packed, state, at(motion, 3), external=jnp.array([1e-3, 0.0, 0.0]))[0]
     assert wind.drape.still == 0.0
 
