@@ -410,3 +410,11 @@ def test_a_garment_far_from_the_body_is_asked_about(wide, asked, body, names, tm
     )
     _, log = bring(tmp_path / "skirt.obj", body, names, Answers(pin="highest"))
     assert any("in the middle" in line and "is it worn elsewhere?" in line for line in log) == asked
+
+
+def test_the_unit_alone_is_proposed_where_it_may_be_what_is_wrong(body, names, tmp_path):
+    """Of a skirt beside the body: lying on its side it would be as near to it."""
+    skirt = storage.load_garment("skirt_1000", body)
+    trimesh.Trimesh(100 * (skirt.vertices - [0.2, 0, 0]), skirt.faces, process=False).export(tmp_path / "skirt.obj")
+    with pytest.raises(ValueError, match=r"Is it meant to be --units cm --up y\?"):
+        bring(tmp_path / "skirt.obj", body, names, Answers(pin="highest"))

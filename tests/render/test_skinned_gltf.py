@@ -15,6 +15,7 @@ from clothjax.body import joint_names, skinning
 from clothjax.commands import render
 from clothjax.evaluation import pictures, rollouts
 from clothjax.render import skinned_gltf
+from clothjax.render.performance import SkinnedPart, SkinnedPerformance
 from clothjax.render.skinned_gltf import to_skinned_glb
 from clothjax.runtime import inference, loading, trained
 from clothjax.simulation import assembly
@@ -230,6 +231,17 @@ def test_at_rest_the_garment_keeps_all_of_its_joints(resting, experiment, clip):
         assert least <= apart(resting.vertices("garment", 0), expected) < most
     for joint in range(len(clip.rotations[17])):
         resting.nodes[joint].rotation = None
+
+
+def test_the_root_is_moved_from_where_it_rests(tmp_path):
+    joints = np.array([[0, 1, 0], [0, 1.5, 0]], np.float32)
+    part = SkinnedPart("flag", joints[None, [0, 1, 1]], np.array([[0, 1, 2]]), np.eye(2)[[0, 1, 1]], (0.5, 0.5, 0.5))
+    motion = Motion(np.tile(np.eye(3, dtype=np.float32), (3, 2, 1, 1)), np.arange(9.0).reshape(3, 3), 30.0)
+    to_skinned_glb(tmp_path / "f.glb", SkinnedPerformance((part,), ("a", "b"), np.array([-1, 0]), joints, {}, motion))
+    flag = Reader(tmp_path / "f.glb")
+    np.testing.assert_allclose(flag.place(0, 0)[:, 3], [0, 2, 2, 1], atol=1e-6)
+    np.testing.assert_allclose(flag.place(0, 2)[:, 3], [6, 8, 8, 1], atol=1e-6)
+    np.testing.assert_allclose(flag.place(1, 2)[:, 3], [6, 8.5, 8, 1], atol=1e-6)
 
 
 def test_bones_of_a_humanoid_are_marked(resting):
