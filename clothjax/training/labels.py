@@ -15,6 +15,7 @@ from clothjax.body import motion_clips
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.files import damage
+from clothjax.material import unscaled
 from clothjax.networks import forces, phi, psi
 from clothjax.networks.normalisation import ForceScales
 from clothjax.physics import descent, incremental_potential
@@ -32,6 +33,7 @@ ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertice
 STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
 SAME = 0.85  # share of what Psi's code lacked in the last frame that a label also tries to start with
 PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
+ALIKE = 0.3  # share of the simulations whose cloth is soft in all respects or stiff in all: few draws are either
 
 
 class Labels(NamedTuple):
@@ -71,7 +73,19 @@ def begin(scene: Scene, clips: Clips, config: Config) -> Simulation:
     """Return the simulations of the first round, leaves [N, ...]."""
     keys = sampling.keys(config.labels.seed, config.labels.simulations)
     clips = jax.tree.map(jnp.asarray, clips)
-    return jax.device_get(jax.jit(jax.vmap(lambda key: pool.begin(key, scene, clips, config)))(keys))
+    return jax.device_get(jax.jit(jax.vmap(lambda key: begin_one(key, scene, clips, config)))(keys))
+
+
+def begin_one(key: Array, scene: Scene, clips: Clips, config: Config) -> Simulation:
+    """Return a new simulation as of `pool.begin`, more often of soft or of stiff cloth."""
+    simulation = pool.begin(key, scene, clips, config)
+    alike_key, share_key = jax.random.split(jax.random.fold_in(key, 1))
+    alike = (jax.random.uniform(alike_key) < ALIKE) & config.material.sample
+    share = jnp.sin(0.5 * jnp.pi * jax.random.uniform(share_key)) ** 2  # mostly near 0 or 1
+    drawn, cloth = simulation.material, config.material
+    limits = {"mu": cloth.mu_range, "lam": cloth.lam_range, "bending": cloth.bending_range}
+    of_share = drawn._replace(**{name: unscaled(share, limit) for name, limit in limits.items()})
+    return simulation._replace(material=jax.tree.map(lambda x, y: jnp.where(alike, x, y), of_share, drawn))
 
 
 def make_segment(scene: Scene, config: Config) -> Callable:
@@ -149,7 +163,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             & (jax.random.uniform(renew_key) > settings.renewed)
         )
         later = simulation._replace(cloth=cloth, frame=simulation.frame + jnp.where(still, 0, settings.frames))
-        new = pool.begin(new_key, scene, clips, config)
+        new = begin_one(new_key, scene, clips, config)
         return Round(jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), later, new), labels)
 
     return segment

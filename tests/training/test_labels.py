@@ -12,6 +12,7 @@ from toy import assert_same, small
 from clothjax.body import motion_clips
 from clothjax.config import LabelsConfig, PhysicsConfig
 from clothjax.evaluation import report
+from clothjax.material import material_inputs
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
@@ -63,6 +64,26 @@ def reduced(garment, code, step, window, scene, candidates, **physics):
 
 def all_faces(scene):
     return np.broadcast_to(np.arange(len(scene.body.faces)), (len(scene.garment.vertices), len(scene.body.faces)))
+
+
+def test_simulations_of_labels_are_more_often_soft_or_stiff_in_all_respects(toy):
+    experiment, clips, _, _ = toy
+    cloth, config = experiment.config.material, experiment.config
+    many = dataclasses.replace(config, labels=dataclasses.replace(config.labels, simulations=2000))
+    drawn = labels.begin(experiment.scene, clips, many).material
+    inputs = np.asarray(jax.vmap(lambda one: material_inputs(one, cloth))(drawn))
+    assert (inputs > -1e-5).all() and (inputs < 1 + 1e-5).all()
+    alike = np.ptp(inputs, axis=1) < 1e-4
+    assert np.mean(alike) == pytest.approx(labels.ALIKE, abs=0.04)
+    ends = (inputs[:, 0] < 0.1) | (inputs[:, 0] > 0.9)
+    assert np.mean(ends[alike]) == pytest.approx(0.41, abs=0.07)  # 4 asin(sqrt(0.1)) / pi
+    assert np.mean(ends[~alike]) == pytest.approx(0.2, abs=0.04)
+    low, high = cloth.density_range.low, cloth.density_range.high
+    density = (np.asarray(drawn.density) - low) / (high - low)
+    assert np.mean(density) == pytest.approx(0.5, abs=0.03)
+    one = dataclasses.replace(config, material=dataclasses.replace(cloth, sample=False))
+    of_one = labels.begin(experiment.scene, clips, one).material
+    assert (np.asarray(of_one.mu) == np.float32(cloth.mu)).all()
 
 
 @pytest.mark.parametrize("edges", [True, False])
