@@ -101,7 +101,7 @@ def test_a_specialised_model_keeps_its_shapes(wide):
 
 
 def test_influences_are_the_largest_and_make_up_one(motion):
-    model = cj.load("dress")
+    model = cj.load("tshirt")
     for count in (1, 4):
         fewer = specialise.specialise(model, max_influences=count).network.weights
         assert (np.count_nonzero(fewer, axis=0) <= count).all()
