@@ -48,11 +48,6 @@ def sample_material(key: Array, config: Config) -> Material:
     if not cloth.sample:
         return configured_material(config)
 
-    def draw(key: Array, limits: Range) -> Array:
-        uniform = jax.random.uniform(key)
-        if limits.log:
-            return limits.low * (limits.high / limits.low) ** uniform
-        return limits.low + (limits.high - limits.low) * uniform
-
     ranges = (cloth.density_range, cloth.mu_range, cloth.lam_range, cloth.bending_range)
-    return Material(*(draw(k, limits) for k, limits in zip(jax.random.split(key, 4), ranges, strict=True)))
+    pairs = zip(jax.random.split(key, 4), ranges, strict=True)
+    return Material(*(unscaled(jax.random.uniform(k), limits) for k, limits in pairs))

@@ -33,7 +33,7 @@ ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertice
 STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
 SAME = 0.85  # share of what Psi's code lacked in the last frame that a label also tries to start with
 PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
-ALIKE = 0.3  # share of the simulations whose cloth is soft in all respects or stiff in all: few draws are either
+ALIKE = 0.3  # share of the simulations whose cloth is mostly soft in all respects or stiff in all: few draws are either
 
 
 class Labels(NamedTuple):

@@ -82,6 +82,7 @@ def test_simulations_of_labels_are_more_often_soft_or_stiff_in_all_respects(toy)
     density = (np.asarray(drawn.density) - low) / (high - low)
     assert np.mean(density) == pytest.approx(0.5, abs=0.03)
     one = dataclasses.replace(config, material=dataclasses.replace(cloth, sample=False))
+    assert len(set(inputs[alike, 0])) > 100  # each draws its own
     of_one = labels.begin(experiment.scene, clips, one).material
     assert (np.asarray(of_one.mu) == np.float32(cloth.mu)).all()
 
@@ -202,6 +203,19 @@ def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finish
     np.testing.assert_array_equal(again.labels.code[::5][on], after.cloth.latent[on])
 
 
+def test_simulations_that_begin_anew_have_such_cloth_too(toy, monkeypatch):
+    experiment, clips, _, blank = toy
+    settings = dataclasses.replace(experiment.config.labels, renewed=1.0, frames=1, descent_steps=1)
+    monkeypatch.setattr(labels, "ALIKE", 0.0)
+    before = labels.begin(experiment.scene, clips, experiment.config)
+    monkeypatch.setattr(labels, "ALIKE", 1.0)
+    collect = labels.make_collect(experiment.scene, clips, dataclasses.replace(experiment.config, labels=settings))
+    after = collected(toy, collect, blank, before).simulations
+    for simulations, alike in ((before, False), (after, True)):
+        inputs = jax.vmap(lambda one: material_inputs(one, experiment.config.material))(simulations.material)
+        assert ((np.ptp(inputs, axis=1) < 1e-4) == alike).all()
+
+
 @pytest.mark.slow
 def test_labels_go_on_from_what_psi_lacked_in_the_last_frame(toy, monkeypatch):
     """A Psi that is followed and holds the code lacks more and more; two steps a frame then catch up."""
@@ -254,7 +268,7 @@ def test_a_simulation_feels_what_pushes_it_and_whether_its_body_moves(toy, monke
     monkeypatch.setattr(labels, "draw_external", lambda *_: push)
     monkeypatch.setattr(labels, "STILL", 1.0 if stands else 0.0)
     after, pushed = collected(toy, labels.make_collect(scene, clips, config), blank)
-    simulation = pool.begin(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
+    simulation = labels.begin_one(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
     character = pool.dressed(scene, simulation.betas, simulation.material, config)
     moves = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
 
@@ -355,7 +369,7 @@ def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of)
     scene, config = experiment.scene, experiment.config
     make = animators.force_psi_animator(params["garment"], state.normalizers)
 
-    simulation = pool.begin(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
+    simulation = labels.begin_one(sampling.keys(config.labels.seed, 2)[0], scene, clips, config)
     character = pool.dressed(scene, simulation.betas, simulation.material, config)
     poses = jax.tree.map(lambda x: x[0], motion_clips.there_and_back(clips, simulation.frame, 5))
 
