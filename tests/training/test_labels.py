@@ -16,7 +16,7 @@ from clothjax.material import material_inputs
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
-from clothjax.runtime import loading, trained
+from clothjax.runtime import inference, loading, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
 from clothjax.training import candidates, imitation, labels, pipeline, pool, sampling, stage1
 from clothjax.training.labels import Round
@@ -419,7 +419,7 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
 
 
 @pytest.mark.slow
-def test_a_run_with_forces_is_tuned_and_measured_but_not_yet_used_elsewhere(toy, tmp_path):
+def test_a_run_with_forces_is_tuned_measured_and_packed(toy, tmp_path):
     config = toy[0].config
     config = dataclasses.replace(
         config,
@@ -430,7 +430,10 @@ def test_a_run_with_forces_is_tuned_and_measured_but_not_yet_used_elsewhere(toy,
     pipeline.train(config, tmp_path)
     measured = report.evaluate(tmp_path)["evaluation"]["psi"]
     assert np.isfinite(measured["energy_gap"]) and measured["swing_ratio"] > 0
-    with pytest.raises(ValueError, match="does not run outside training yet"):
-        loading.load(tmp_path)
-    with pytest.raises(ValueError, match="cannot be packed yet"):
-        trained.pack(tmp_path, tmp_path / "packed")
+    trained.pack(tmp_path, tmp_path / "packed")
+    clip = assembly.evaluation_motion(toy[0], "walk_3")
+    clip = clip._replace(rotations=clip.rotations[:10], translation=clip.translation[:10])
+    of_run, of_pack = (inference.animate(loading.load(folder), clip)[0] for folder in (tmp_path, tmp_path / "packed"))
+    assert np.isfinite(of_run).all()
+    apart = np.linalg.norm(of_pack - of_run, axis=-1)  # by eight bits; a vertex may be pushed to another plane
+    assert np.percentile(apart, 99) < 2e-3
