@@ -351,10 +351,6 @@ class LabelsConfig:
     """Simulations that are labelled in a round, each of its own clip, betas and material. They go on in the next."""
     frames: int = 30
     """Frames by which a round moves a simulation."""
-    candidates: int = 16
-    """Faces of the body whose planes a vertex can feel: those that it is near to most often in rollouts of Phi."""
-    candidate_rollouts: int = 96
-    """Rollouts of Phi in which they are counted."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
     descent_steps: int = 20
@@ -378,8 +374,10 @@ class LabelsConfig:
     """Of the linear map's first value."""
     seed: int = 0
 
+    RETIRED: ClassVar[dict[str, Any]] = {"candidates": ANYTHING, "candidate_rollouts": ANYTHING}
+
     def __post_init__(self):
-        for name in ("rounds", "simulations", "frames", "candidates", "candidate_rollouts"):
+        for name in ("rounds", "simulations", "frames"):
             _require(getattr(self, name) >= 1, f"labels.{name} must be >= 1, got {getattr(self, name)}")
         _require(all(0 <= share <= 1 for share in self.shares), f"labels.shares must be in [0, 1]: {self.shares}")
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 import trimesh
-from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from toy import small
 
@@ -372,8 +372,6 @@ def random_force_psi(skip=True, limit=5.0, **physics):
     }
     mixed = rng.normal(size=(size, size))
     whitening = forces.whitening(0.01 * (mixed @ mixed.T / size + 0.1 * np.eye(size)))
-    body = np.asarray(scene.body.vertices)[np.asarray(scene.body.faces)].mean(axis=1)
-    candidates = KDTree(body).query(np.asarray(scene.garment.vertices), 5)[1].astype(np.int32)
     count = (2 + len(forces.KINDS)) * size + 14
     network = psi.ForcePsi(config.stage2, size)
     predictor = mlp.init(network, jax.random.key(1), jnp.zeros(count))
@@ -384,7 +382,7 @@ def random_force_psi(skip=True, limit=5.0, **physics):
     predictor["mlp"]["dense_2"] |= {"kernel": 300 * predictor["mlp"]["dense_2"]["kernel"]}
     scales = ForceScales(
         *(jnp.asarray(x, jnp.float32) for x in (0.1 * rng.normal(size=count), spread, output)),
-        whitening, *(jnp.full(size, x, jnp.float32) for x in (-limit, limit)), candidates,
+        whitening, *(jnp.full(size, x, jnp.float32) for x in (-limit, limit)),
     )  # fmt: skip
     return ForcePsi(experiment, garment, predictor, scales)
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import sidecar
+from clothjax.geometry import proximity
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
@@ -25,7 +26,8 @@ from clothjax.types import Array, Motion
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
-VERSION = 1  # of a model without forces; one with forces has 2
+VERSION = 1  # of a model without forces; ...
+FORCED = 3  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -67,7 +69,7 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
     forced = isinstance(predictor, ForcePredictor)
     hidden = _mlp(predictor)[1:] if isinstance(predictor, ForcePredictor) else predictor.hidden
     head = (
-        MAGIC, VERSION + forced, len(model.parents), len(model.input_joints), len(model.moving),
+        MAGIC, FORCED if forced else VERSION, len(model.parents), len(model.input_joints), len(model.moving),
         wearer.template.shape[1], code, len(hidden), len(network.decoder), len(network.read.bias) > network.width,
         model.config.model.blendshape_relu, network.mix is not None, bool(wearer.known), forced, 0, 0,
     )  # fmt: skip
@@ -98,7 +100,7 @@ def _arrays(model: Model) -> Iterator[np.ndarray]:
 
 
 def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
-    """Yield the arrays of a predictor with forces: cloth, body and candidates, then layers."""
+    """Yield the arrays of a predictor with forces: cloth and body, then layers."""
     network, cloth, physics = model.network, model.wearer.cloth, model.config.physics
     assert cloth is not None
     if predictor.corrections is not None:
@@ -108,9 +110,13 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     felt, template = drape.felt_garment(model)
     mesh, rest, scales = predictor.mesh, cloth.rest, predictor.scales
     edges = np.asarray(forces.touching_edges(mesh, physics))
-    vertices, neighbours = scales.candidates.shape
+    # a cluster of the body's faces is where they are in the file, and vertices of one joint are side by side
+    order = np.argsort(np.asarray(predictor.body).argmax(axis=0), kind="stable")
+    faces = np.argsort(order)[np.asarray(predictor.faces)][np.asarray(predictor.clusters.points).reshape(-1)]
+    near = np.asarray(predictor.clusters.positions, np.int32)
+    near = np.pad(near, ((0, 0), (0, proximity.ASKED - near.shape[1])), mode="edge")
     yield np.array(
-        [vertices, len(mesh.faces), len(mesh.hinges), len(cloth.body), len(predictor.faces), neighbours,
+        [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
          predictor.felt is not None, len(edges)],
         np.int32,
     )  # fmt: skip
@@ -128,11 +134,11 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(mesh.hinges.T)
     yield _padded(stiffness / (4.0 * np.asarray(rest.hinge_area)))
     yield _padded(rest.hinge_angle)
-    yield _padded(predictor.faces.T)
-    yield _padded(scales.candidates.T)
+    yield _padded(faces.T)
+    yield near
     yield _padded(edges.T)
-    yield _padded(predictor.body)
-    yield _padded(cloth.body.T)
+    yield _padded(predictor.body[:, order])
+    yield _padded(cloth.body[order].T)
     if predictor.felt is not None:
         yield _padded(felt.weights)
         yield _padded(predictor.felt.nearest)

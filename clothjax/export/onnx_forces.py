@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export.onnx_graph import Graph
+from clothjax.geometry.proximity import TRIED, Clusters
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
@@ -235,24 +236,18 @@ def _bending(g: Graph, model: Model, it: Parts, held: str, hinges: np.ndarray) -
 
 
 def _planes(g: Graph, it: Parts, edges: np.ndarray, held: str, transforms: str, advance: str) -> tuple[str, str]:
-    """Points and normals [N, 3, V] of the nearest candidates, raised, as of `forces.felt`."""
+    """Points and normals [N, 3, V] of the nearest faces, raised, as of `forces.felt`."""
     predictor, cloth = it.predictor, it.cloth
-    candidates = np.asarray(predictor.scales.candidates)
-    vertices, count = candidates.shape
+    vertices = it.template.shape[1]
     rows = blended(g, transforms, np.asarray(predictor.body))
     body = g("Add", moved(g, rows, g.constant(np.asarray(cloth.body).T[None])), advance)
-    corners = [g("Gather", body, np.asarray(predictor.faces)[:, k], axis=2) for k in range(3)]
+    faces = np.asarray(predictor.faces)[np.asarray(predictor.clusters.points).reshape(-1)]
+    corners = [g("Gather", body, faces[:, k], axis=2) for k in range(3)]
     centres = g("Mul", g("Add", g("Add", corners[0], corners[1]), corners[2]), np.float32(1.0 / 3.0))
     normals = _cross(g, *(g("Sub", corner, corners[0]) for corner in corners[1:]))
     length = g("Sqrt", g("Max", _dot(g, normals, normals), np.float32(1e-30)))
     normals = g("Div", normals, length)
-    near = g.reshape(g("Gather", centres, candidates.reshape(-1), axis=2), 3, vertices, count)
-    apart = g("Sub", g("Unsqueeze", held, np.array([3], np.int64)), near)
-    distance = g("ReduceSumSquare", apart, axes=[1], keepdims=0)
-    nearest = g("ArgMin", distance, axis=2, keepdims=1)
-    every = g("Add", g("Mul", nearest, np.int64(0)), candidates[None].astype(np.int64))  # [N, V, K]
-    face = g("GatherElements", every, nearest, axis=2)  # [N, V, 1]
-    face = g("Transpose", face, perm=[0, 2, 1])
+    face = g.reshape(_nearest(g, predictor.clusters, held, centres), 1, vertices)
     face = g("Concat", face, face, face, axis=1)
     point, normal = (g("GatherElements", x, face, axis=2) for x in (centres, normals))
     if len(edges) == 0:
@@ -265,6 +260,38 @@ def _planes(g: Graph, it: Parts, edges: np.ndarray, held: str, transforms: str, 
     gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 1, *table.shape)
     raised = g("ReduceMax", gathered, axes=[3], keepdims=0)
     return g("Add", point, g("Mul", raised, normal)), normal
+
+
+def _nearest(g: Graph, clusters: Clusters, held: str, centres: str) -> str:
+    """Places [N, V] of the nearest of the points [N, 3, 16 P], as of `proximity.nearest_in_clusters`.
+
+    Args:
+        centres: the points in the order of their clusters.
+    """
+    asked, (count, size) = np.asarray(clusters.positions), np.shape(clusters.points)
+    groups, tried = len(asked), min(TRIED, count)
+    near = g.reshape(g("Gather", held, asked.reshape(-1), axis=2), 3, *asked.shape)
+    middle = g("ReduceMean", near, axes=[3], keepdims=1)  # [N, 3, G, 1]
+    patches = g.reshape(centres, 3, count, size)
+    means = g("ReduceMean", patches, axes=[3], keepdims=1)
+    radius = g("ReduceSumSquare", g("Sub", patches, means), axes=[1], keepdims=1)
+    radius = g("Sqrt", g("ReduceMax", radius, axes=[3], keepdims=0))  # [N, 1, P]
+    apart = g("Sub", middle, g.reshape(means, 3, 1, count))
+    bound = g("Sub", g("Sqrt", g("ReduceSumSquare", apart, axes=[1], keepdims=0)), radius)
+    chosen = g("Mul", g.reshape(g.lowest(bound, tried), groups, tried, 1), np.int64(size))
+    places = g.reshape(g("Add", chosen, np.arange(size)), 1, groups * tried * size)
+    beside = g("GatherElements", centres, g("Concat", places, places, places, axis=1), axis=2)
+    # half the squared distance without the part of the position, from the middle: far from it products cancel
+    beside = g("Sub", g.reshape(beside, 3, groups, tried * size), middle)
+    half = g("Mul", g("ReduceSumSquare", beside, axes=[1], keepdims=0), np.float32(0.5))
+    near = g("Transpose", g("Sub", near, middle), perm=[0, 2, 3, 1])
+    product = g("MatMul", near, g("Transpose", beside, perm=[0, 2, 1, 3]))  # [N, G, S, tried size]
+    score = g("Sub", g("Unsqueeze", half, np.array([2], np.int64)), product)
+    best = g("ArgMin", score, axis=3, keepdims=0)  # [N, G, S]
+    found = g("GatherElements", g.reshape(places, groups, tried * size), best, axis=2)
+    order = np.zeros(asked.max() + 1, np.int64)
+    order[asked.reshape(-1)] = np.arange(asked.size)
+    return g("Gather", g.reshape(found, asked.size), order, axis=1)
 
 
 def _contact(g: Graph, model: Model, held: str, point: str, normal: str) -> str:

@@ -93,6 +93,13 @@ class Graph:
         scale = smoothing_scale(limits, layer.kernel)
         return self.layer(self("Mul", x, 1.0 / scale), Layer(np.asarray(layer.kernel) * scale[:, None], layer.bias))
 
+    def lowest(self, x: str, count: int) -> str:
+        """Return the places, in order, of the `count` lowest entries along the last axis of x."""
+        names = [f"lowest_{len(self.nodes)}", f"places_{len(self.nodes)}"]
+        given = [x, self.constant(np.array([count], np.int64))]
+        self.nodes.append(self.onnx.helper.make_node("TopK", given, names, name=names[0], largest=0))
+        return names[1]
+
     def all(self, flags: str, axis: int) -> str:
         """Return whether all of the bools along an axis are true; the axis stays, with size 1."""
         least = self("ReduceMin", self("Cast", flags, to=self.onnx.TensorProto.FLOAT), axes=[axis], keepdims=1)

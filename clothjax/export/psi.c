@@ -17,6 +17,9 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
+#define NEIGHBOURS 8      /* vertices of a cluster; of the body's faces ... */
+#define PATCH 16          /* ... a cluster has as many, and ... */
+#define TRIED 16          /* ... as many clusters are searched for what is nearest */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
@@ -39,14 +42,14 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 } exact;
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
-    int32_t vertices, triangles, hinges, body, faces, candidates, edges;
+    int32_t vertices, triangles, hinges, body, faces, clusters, edges;
     float timestep, gravity;
     float stiffness, offset, highest, deepest;        /* of planes that are touched: in N/m; m; raised, pushed at most */
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
     const float *bend, *angle;                        /* [hinges] */
-    const int32_t *face, *candidate, *edge;           /* [3][faces], [candidates][vertices], [2][edges] */
+    const int32_t *face, *cluster, *edge;             /* [3][faces], by PATCH; [clusters][NEIGHBOURS]; [2][edges] */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
     const float *weight;                              /* [moving][vertices] */
     const int32_t *nearest;                           /* [vertices that are shown], the vertex that feels at each */
@@ -84,6 +87,8 @@ struct psi_state {
     float still; /* frames for which the body has stood still and nothing has pushed */
     float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
     float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
+    float *patch;          /* [5][faces / PATCH], middle and radius of clusters of faces, how near one is */
+    int32_t *nearest;      /* the face that is nearest */
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it was raised */
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
@@ -224,7 +229,8 @@ static void read_forces(reader *r, psi_model *m) {
     f->hinges = within(r, head[2], 0, MOST_ELEMENTS);
     f->body = within(r, head[3], 1, MOST_ELEMENTS);
     f->faces = within(r, head[4], 1, MOST_ELEMENTS);
-    f->candidates = within(r, head[5], 1, 1024);
+    f->clusters = within(r, head[5], 1, MOST_ELEMENTS / NEIGHBOURS);
+    if (f->faces % PATCH) r->sound = 0;
     m->apart = head[6];
     f->edges = within(r, head[7], 0, MOST_ELEMENTS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
@@ -238,7 +244,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->bend = floats(r, padded(f->hinges));
     f->angle = floats(r, padded(f->hinges));
     f->face = indices(r, 3 * padded(f->faces), f->body);
-    f->candidate = indices(r, f->candidates * padded(f->vertices), f->faces);
+    f->cluster = indices(r, NEIGHBOURS * f->clusters, f->vertices);
     f->edge = indices(r, 2 * padded(f->edges), f->vertices);
     f->body_weight = floats(r, (size_t)m->moving * padded(f->body));
     f->body_rest = floats(r, 3 * (size_t)padded(f->body));
@@ -303,10 +309,10 @@ static psi_model *failed(psi_model *m, const char **error, const char *why) {
 }
 
 static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char **error) {
-    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 2 */
+    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 3 */
     int32_t version[2] = {0, 0};
     if (size >= ALIGN) memcpy(version, bytes, sizeof version);
-    if (version[0] != name || version[1] < 1 || version[1] > 2) return failed(m, error, "not a .psi of this version");
+    if (version[0] != name || (version[1] != 1 && version[1] != 3)) return failed(m, error, "not a .psi of this version");
     reader r = {bytes, size, 1};
     read_model(&r, m);
     if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
@@ -527,11 +533,19 @@ static void bones(const psi_model *m, psi_state *s) {
     }
 }
 
+/* Whether any of LANES vertices has weight on a joint; most joints have none of neighbours. */
+static int carries(const float *weight) {
+    int any = 0;
+    for (int i = 0; i < LANES; i++) any |= weight[i] != 0.0f;
+    return any;
+}
+
 /* LANES vertices at x, y, z with weights [moving][wide], skinned; added to `moved`, zeros before. */
 static void skin_lanes(const psi_model *m, const psi_state *s, const float *weight, size_t wide, const float *x,
                        const float *y, const float *z, float moved[3][LANES]) {
     for (int32_t k = 0; k < m->moving; k++) {
         const float *w = weight + k * wide, *a = s->skinning + 12 * k;
+        if (!carries(w)) continue;
         for (int i = 0; i < LANES; i++) {
             moved[0][i] += w[i] * (a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3]);
             moved[1][i] += w[i] * (a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7]);
@@ -595,10 +609,13 @@ static void dense_kinds(const layer *l, float *const *x, float *const *y, psi_st
 static void blend(const psi_model *m, const psi_state *s, const float *weight, int32_t count, float *rows) {
     const int32_t wide = padded(count);
     for (int32_t v = 0; v < wide; v += LANES) {
+        int32_t busy[MOST_JOINTS], joints = 0;
+        for (int32_t k = 0; k < m->moving; k++)
+            if (carries(weight + (size_t)k * wide + v)) busy[joints++] = k;
         for (int c = 0; c < 12; c++) {
             float sum[LANES] = {0};
-            for (int32_t k = 0; k < m->moving; k++) {
-                const float *w = weight + (size_t)k * wide + v, a = s->skinning[12 * k + c];
+            for (int32_t k = 0; k < joints; k++) {
+                const float *w = weight + (size_t)busy[k] * wide + v, a = s->skinning[12 * busy[k] + c];
                 for (int i = 0; i < LANES; i++) sum[i] += w[i] * a;
             }
             memcpy(rows + (size_t)c * wide + v, sum, sizeof sum);
@@ -664,27 +681,106 @@ static void push_momentum(const psi_model *m, psi_state *s, float *restrict forc
     }
 }
 
-/* The plane of the face, of a vertex's candidates, whose centre is nearest. */
+/* Middles and radii of the clusters of faces, [3][row] and [row]; returns the largest radius. */
+static float find_patches(const psi_model *m, const psi_state *s, size_t row, float *restrict middle) {
+    const int32_t faces = padded(m->f.faces);
+    float *restrict radius = middle + 3 * row, most = 0.0f;
+    for (int32_t p = 0; p < m->f.faces / PATCH; p++) {
+        const float *centre = s->centre + p * PATCH;
+        float apart[PATCH] = {0}, farthest = 0.0f;
+        for (int c = 0; c < 3; c++) {
+            float sum = 0.0f;
+            for (int i = 0; i < PATCH; i++) sum += centre[c * faces + i];
+            middle[c * row + p] = sum / PATCH;
+            for (int i = 0; i < PATCH; i++) {
+                const float x = centre[c * faces + i] - sum / PATCH;
+                apart[i] += x * x;
+            }
+        }
+        for (int i = 0; i < PATCH; i++) farthest = apart[i] > farthest ? apart[i] : farthest;
+        radius[p] = sqrtf(farthest);
+        most = radius[p] > most ? radius[p] : most;
+    }
+    return most;
+}
+
+/* By how much the least key that is above the last is above it, less one; none if that does not fit in 31 bits. */
+static uint32_t following(const int32_t *key, int32_t count, int32_t last) {
+    uint32_t least = UINT32_MAX;
+    for (int32_t i = 0; i < count; i++) {
+        const uint32_t beyond = (uint32_t)key[i] - (uint32_t)last - 1; /* those below come out as the largest */
+        least = beyond < least ? beyond : least;
+    }
+    return least;
+}
+
+/* Compares positions [3][NEIGHBOURS] with the faces of a cluster, whose first is `first`. */
+static void compare(const float *restrict x, const float *restrict centre, size_t faces, int32_t first,
+                    float *restrict least, int32_t *restrict place) {
+    for (int j = 0; j < PATCH; j++) {
+        const float cx = centre[j], cy = centre[faces + j], cz = centre[2 * faces + j];
+#pragma GCC unroll 1 /* else it is unrolled before it can become vectors */
+        for (int i = 0; i < NEIGHBOURS; i++) {
+            const float a = x[i] - cx, b = x[NEIGHBOURS + i] - cy, c = x[2 * NEIGHBOURS + i] - cz;
+            const float apart = a * a + b * b + c * c;
+            place[i] = apart < least[i] ? first + j : place[i];
+            least[i] = apart < least[i] ? apart : least[i];
+        }
+    }
+}
+
+/* Finds the faces whose centres are nearest to the vertices of the held garment, as proximity.nearest_in_clusters. */
+static void find_nearest(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const int32_t wide = padded(f->vertices), faces = padded(f->faces), patches = f->faces / PATCH;
+    const size_t row = padded(patches);
+    const float *middle = s->patch, *radius = middle + 3 * row, most = find_patches(m, s, row, s->patch);
+    int32_t bits = 1, *restrict key = (int32_t *)(s->patch + 4 * row);
+    while (bits < patches) bits *= 2;
+    bits -= 1; /* the last bits of a key hold its cluster, the others how near that may be */
+    for (int32_t g = 0; g < f->clusters; g++) {
+        const int32_t *vertex = f->cluster + g * NEIGHBOURS;
+        float x[3][NEIGHBOURS], mean[3] = {0}, least[NEIGHBOURS], span = 0.0f;
+        int32_t place[NEIGHBOURS] = {0}, last = -1;
+        for (int c = 0; c < 3; c++)
+            for (int i = 0; i < NEIGHBOURS; i++) mean[c] += (x[c][i] = s->held[c * wide + vertex[i]]) / NEIGHBOURS;
+        for (int i = 0; i < NEIGHBOURS; i++) {
+            const float a = x[0][i] - mean[0], b = x[1][i] - mean[1], c = x[2][i] - mean[2];
+            least[i] = FLT_MAX;
+            span = a * a + b * b + c * c > span ? a * a + b * b + c * c : span;
+        }
+        span = sqrtf(span);
+        for (int32_t p = 0; p < patches; p++) {
+            const float a = middle[p] - mean[0], b = middle[row + p] - mean[1], c = middle[2 * row + p] - mean[2];
+            const float square = a * a + b * b + c * c + FLT_MIN, bound = square * inverse_root(square) + (most - radius[p]);
+            int32_t whole;
+            memcpy(&whole, &bound, sizeof whole);
+            key[p] = (whole & ~bits) | p;
+        }
+        for (int k = 0; k < TRIED; k++) {
+            const uint32_t beyond = following(key, patches, last);
+            if (beyond > INT32_MAX) break;
+            last += 1 + (int32_t)beyond;
+            const int32_t whole = last & ~bits, p = last & bits;
+            float bound, farthest = 0.0f;
+            memcpy(&bound, &whole, sizeof bound);
+            bound -= most + span;
+            for (int i = 0; i < NEIGHBOURS; i++) farthest = least[i] > farthest ? least[i] : farthest;
+            if (bound > 0.0f && bound * bound > farthest) break; /* nothing nearer is left */
+            compare(x[0], s->centre + p * PATCH, faces, p * PATCH, least, place);
+        }
+        for (int i = 0; i < NEIGHBOURS; i++) s->nearest[vertex[i]] = place[i];
+    }
+}
+
+/* The plane of the face that is nearest to a vertex. */
 static void find_planes(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
     const int32_t wide = padded(f->vertices), faces = padded(f->faces), body = padded(f->body);
     const float *cx = s->centre, *cy = cx + faces, *cz = cy + faces;
     for (int32_t v = 0; v < wide; v += LANES) {
-        const float *x = s->held + v, *y = x + wide, *z = y + wide;
-        float least[LANES];
-        int32_t nearest[LANES];
-        for (int i = 0; i < LANES; i++) least[i] = FLT_MAX, nearest[i] = f->candidate[v + i];
-        for (int32_t k = 0; k < f->candidates; k++) {
-            const int32_t *each = f->candidate + (size_t)k * wide + v;
-            for (int i = 0; i < LANES; i++) {
-                const int32_t j = each[i];
-                const float a = x[i] - cx[j], b = y[i] - cy[j], c = z[i] - cz[j], apart = a * a + b * b + c * c;
-                nearest[i] = apart < least[i] ? j : nearest[i];
-                least[i] = apart < least[i] ? apart : least[i];
-            }
-        }
         for (int i = 0; i < LANES; i++) {
-            const int32_t j = nearest[i];
+            const int32_t j = s->nearest[v + i];
             float e[3], l[3], normal[3];
             for (int c = 0; c < 3; c++) {
                 const float *p = s->body + c * body;
@@ -935,6 +1031,7 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     memset(elastic, 0, 3 * wide * sizeof(float));
     push_stretching(f, s->held, elastic);
     push_bending(f, s->held, elastic);
+    find_nearest(m, s);
     find_planes(m, s);
     raise_planes(m, s);
     push_contact(m, s, s->force + 6 * wide);
@@ -1072,6 +1169,8 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->held = part(room, &used, 3 * vertices);
     s->blended = part(room, &used, 12 * vertices);
     s->force = part(room, &used, 3 * KINDS * vertices);
+    s->patch = part(room, &used, 5 * (size_t)padded(m->f.faces / PATCH));
+    s->nearest = (int32_t *)part(room, &used, vertices);
     s->plane = part(room, &used, 4 * vertices);
     s->raised = part(room, &used, vertices);
     s->body = part(room, &used, 3 * (size_t)padded(m->f.body));

@@ -11,6 +11,7 @@ import numpy as np
 from clothjax.config import Config
 from clothjax.files import configuration, damage
 from clothjax.files.checkpoint import nested
+from clothjax.geometry.proximity import Clusters
 from clothjax.networks.normalisation import ForceScales, Whitening
 from clothjax.runtime.models import (
     Bounds,
@@ -26,7 +27,9 @@ from clothjax.runtime.models import (
 )
 from clothjax.types import Material, Mesh, Rest
 
-FORMAT = 2  # of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`
+# of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`. With forces, they
+# know no older one
+FORMAT = 3
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
 
 
@@ -61,6 +64,10 @@ def from_safetensors(path: str | Path) -> Model:
             arrays = {name: jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())}  # not a dict
         version = about.get("format", 1)
         damage.refuse_newer(path, version, FORMAT)
+        if version < FORMAT and "network.predictor.faces" in arrays:
+            raise damage.OtherFormat(
+                f"{path}: its Psi with forces found what it touches in another way (format {version}); export it again"
+            )
         if version == 1:
             arrays = {_renamed(name): array for name, array in arrays.items()}
         config = configuration.from_dict(Config, about["config"], str(path))
@@ -91,7 +98,8 @@ def from_safetensors(path: str | Path) -> Model:
             felt = fields(Felt, f"{own}.felt") if f"{own}.felt.shapes" in arrays else None
             whitening = fields(Whitening, f"{own}.scales.whitening")
             scales = fields(ForceScales, f"{own}.scales", whitening=whitening)
-            parts = {"params": nested(params), "scales": scales, "mesh": fields(Mesh, f"{own}.mesh"), "felt": felt}
+            parts = {name: fields(of, f"{own}.{name}") for name, of in (("mesh", Mesh), ("clusters", Clusters))}
+            parts |= {"params": nested(params), "scales": scales, "felt": felt}
             predictor = fields(ForcePredictor, own, **parts, corrections=arrays.get(f"{own}.corrections"))
             worn = "wearer.cloth"
             parts = {"rest": fields(Rest, f"{worn}.rest"), "material": fields(Material, f"{worn}.material")}
@@ -111,7 +119,7 @@ def from_safetensors(path: str | Path) -> Model:
         )
         wearer = fields(Wearer, "wearer", cloth=cloth)
         return Model(network=network, wearer=wearer, faces=arrays["faces"], config=config, **static)
-    except damage.NewerFormat:
+    except damage.OtherFormat:
         raise
     except (library.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(f"{path}: not a whole model in safetensors ({error}); convert it again") from error

@@ -13,8 +13,8 @@ UNREADABLE = (
 )  # fmt: skip
 
 
-class NewerFormat(ValueError):
-    """A file was written by a newer version of this library."""
+class OtherFormat(ValueError):
+    """A file was written by another version of this library, which this one does not read."""
 
 
 def refuse_newer(path: str | Path, version: int, known: int) -> None:
@@ -24,7 +24,7 @@ def refuse_newer(path: str | Path, version: int, known: int) -> None:
         version, known: numbers of the file's format, and of the newest that is known here.
 
     Raises:
-        NewerFormat: if `version` is the larger.
+        OtherFormat: if `version` is the larger.
     """
     if version > known:
-        raise NewerFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")
+        raise OtherFormat(f"{path}: has format {version}, this version of clothjax reads up to {known}; update it")

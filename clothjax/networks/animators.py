@@ -167,7 +167,7 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
                     held,
                     inputs.time_step,
                     surface(scene, inputs.window.following),
-                    scales.candidates,
+                    scene.clusters,
                     scene.mesh,
                     config.physics,
                 )

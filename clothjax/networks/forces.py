@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import PhysicsConfig
+from clothjax.geometry.proximity import Clusters, nearest_in_clusters
 from clothjax.networks.normalisation import Whitening
 from clothjax.physics import incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
@@ -46,8 +47,8 @@ def touching_edges(mesh: Mesh, config: PhysicsConfig) -> Array:
     return mesh.edges if config.edge_contact else mesh.edges[:0]
 
 
-def felt(position: Array, surface: tuple[Array, Array], candidates: Array, edges: Array) -> Contact:
-    """Return the planes that Psi feels, for which there is no search: of each vertex's nearest candidate.
+def felt(position: Array, surface: tuple[Array, Array], clusters: Clusters, edges: Array) -> Contact:
+    """Return the planes that Psi feels: of the body's face whose centroid is nearest to a vertex.
 
     They are raised, so that edges over a round body stay outside of it between their ends: by the height of an arc
     over its chord, (n_a - n_b) . (x_a - x_b) / 8 for normals n at its ends x. A vertex has that of its highest edge.
@@ -55,14 +56,11 @@ def felt(position: Array, surface: tuple[Array, Array], candidates: Array, edges
     Args:
         position: [V, 3] m, the held garment at the next frame.
         surface: centroids [F, 3] m and unit normals [F, 3] of the body's faces at the next frame.
-        candidates: [V, K] int32, faces.
+        clusters: of the garment's vertices and of the faces' centroids.
         edges: [E, 2] int32, of `touching_edges`.
     """
     points, normals = surface
-    nearest, face = jnp.full(len(position), jnp.inf), candidates[:, 0]
-    for each in candidates.T:  # an argmin would take several times as long
-        apart = sum((position[:, axis] - points[:, axis][each]) ** 2 for axis in range(3))
-        nearest, face = jnp.minimum(nearest, apart), jnp.where(apart < nearest, each, face)
+    face = nearest_in_clusters(position, points, clusters)
     normal = normals[face]
     start, end = edges.T
     bulge = jnp.sum((normal[start] - normal[end]) * (position[start] - position[end]), axis=-1) / 8
@@ -95,7 +93,7 @@ def reduced(
     code: Array,
     step: TimeStep,
     surface: tuple[Array, Array] | None,
-    candidates: Array,
+    clusters: Clusters | None,
     mesh: Mesh,
     config: PhysicsConfig,
 ) -> Array:
@@ -104,11 +102,11 @@ def reduced(
     Args:
         garment: from a code to vertices [V, 3] m at the next frame.
         step: the time step; its contact is not used.
-        surface: as of `felt`; None where there is no body to touch.
-        candidates: [V, K] int32, as of `felt`.
+        surface, clusters: as of `felt`; None where there is no body to touch.
     """
     position, pullback = jax.vjp(garment, code)
     edges = touching_edges(mesh, config)
-    step = step._replace(contact=None if surface is None else felt(position, surface, candidates, edges))
+    touched = None if surface is None or clusters is None else felt(position, surface, clusters, edges)
+    step = step._replace(contact=touched)
     forces = on_vertices(position, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

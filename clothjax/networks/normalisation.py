@@ -80,7 +80,7 @@ class Whitening(NamedTuple):
 
 
 class ForceScales(NamedTuple):
-    """Constants of a Psi with forces: scales of its inputs and its output, range of codes, what it can touch."""
+    """Constants of a Psi with forces: scales of its inputs and its output, range of codes."""
 
     middle: Array  # [N] medians of `psi.force_inputs`, subtracted first
     spread: Array  # [N] their spread, divided by
@@ -88,7 +88,6 @@ class ForceScales(NamedTuple):
     whitening: Whitening
     low: Array  # [L] the least and ...
     high: Array  # [L] ... the greatest code of the labels
-    candidates: Array  # [V, K] int32, faces of the body that each vertex may touch
 
 
 def identity(size: int) -> Scale:

@@ -103,7 +103,7 @@ def predict(
     body = skinning.pose_corrected(parts.corrections, cloth.body, pose)
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
     surface, edges = contact_search.centroids(posed, parts.faces), forces.touching_edges(parts.mesh, config.physics)
-    planes = forces.felt(held, surface, parts.scales.candidates, edges)
+    planes = forces.felt(held, surface, parts.clusters, edges)
     step = TimeStep(
         position=drape.position,
         velocity=incremental_potential.pushed(drape.velocity, timestep, external),

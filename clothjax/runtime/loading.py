@@ -12,7 +12,8 @@ import numpy as np
 from clothjax.body import reach, skinning
 from clothjax.config import Config
 from clothjax.files import storage
-from clothjax.geometry import topology
+from clothjax.geometry import proximity, topology
+from clothjax.geometry.proximity import Clusters
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.physics import energies
@@ -66,13 +67,14 @@ def build(
     cloth = config.material
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
-    touched = mesh = None
+    touched = mesh = clusters = None
     if isinstance(normalizers, ForceScales):
-        touched, candidates = _touched(garment, body, normalizers.candidates, config)
-        normalizers = normalizers._replace(candidates=candidates)
+        touched = reach.reachable(body, garment, config.physics.reach)
+        centroids = np.asarray(touched.vertices)[np.asarray(touched.faces)].mean(axis=1)
+        clusters = proximity.clusters(garment.vertices, centroids)
         mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     network, wearer = _arrays(
-        garment, body, touched, mesh, garment_params, predictor, normalizers, betas, material, config
+        garment, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas, material, config
     )
     model = Model(
         network=network,
@@ -87,21 +89,12 @@ def build(
     return in_float32(model)
 
 
-def _touched(garment: Garment, body: Body, candidates: Array, config: Config) -> tuple[Body, np.ndarray]:
-    """Return the part of a body that candidates are of, and the candidates [V, K] int32 numbered among its faces."""
-    within = reach.reachable(body, garment, config.physics.reach)
-    used, numbered = np.unique(np.asarray(candidates), return_inverse=True)
-    faces = np.asarray(within.faces)[used]
-    vertices, renumbered = np.unique(faces, return_inverse=True)
-    touched = reach.part(within, vertices, renumbered.reshape(faces.shape).astype(np.int32))
-    return touched, numbered.reshape(np.shape(candidates)).astype(np.int32)
-
-
 @partial(jax.jit, static_argnames="config")
 def _arrays(
     garment: Garment,
     body: Body,
     touched: Body | None,
+    clusters: Clusters | None,
     mesh: Mesh | None,
     garment_params: dict,
     predictor: dict,
@@ -113,7 +106,8 @@ def _arrays(
     """Build the arrays of a model in one compiled program, which starts faster than many small ones.
 
     Args:
-        touched: the part of the body that is felt, and ...
+        touched: the part of the body that is felt, ...
+        clusters: ... its faces and the garment's vertices in clusters, and ...
         mesh: ... the elements that feel; None without forces.
     """
     given = psi.constant_inputs(betas, material, config.material)
@@ -121,13 +115,13 @@ def _arrays(
     template = skinning.shaped_vertices(garment, betas)
     bias, cloth, latent = jnp.zeros(0), None, None
     if isinstance(normalizers, ForceScales):
-        assert touched is not None and mesh is not None
+        assert touched is not None and clusters is not None and mesh is not None
         rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
         shaped = skinning.shaped_vertices(touched, betas)
         cloth = Cloth(constants, areas * material.density, rest, material, shaped, None)
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
-        parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, weights, corrections, None)
+        parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, clusters, weights, corrections, None)
         bounds = Bounds(normalizers.low, normalizers.high, FORCE_SLACK * (normalizers.high - normalizers.low))
         first = jnp.zeros(len(normalizers.low))
     else:

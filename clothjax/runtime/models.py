@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from clothjax.config import Config
+from clothjax.geometry.proximity import Clusters
 from clothjax.networks.normalisation import ForceScales
 from clothjax.types import Array, Material, Mesh, Rest
 
@@ -76,6 +77,7 @@ class ForcePredictor(NamedTuple):
     scales: ForceScales
     mesh: Mesh  # of the garment's elements
     faces: Array  # [F, 3] int32 of the part of the body that can be touched
+    clusters: Clusters  # of the vertices that feel, and of the centroids of these faces
     body: Array  # [J', B] skinning weights of that part
     corrections: Array | None  # [B, 3, 9 (J - 1)] m, its pose blend shapes
     felt: Felt | None  # the garment that feels, if it is not the one that is shown

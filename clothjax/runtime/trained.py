@@ -23,9 +23,9 @@ from clothjax.types import Material
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
-HESSIAN, CANDIDATES = "phi/inverse_hessian", "normalizers/candidates"
+HESSIAN = "phi/inverse_hessian"
 HALVED = ("phi/garment/blendshapes", HESSIAN)  # eight bits would strain the cloth, slow the descent
-FORMAT = 2  # of a packed model; 1 is the same without a number
+FORMAT = 3  # of a packed model; earlier ones have arrays that are no longer used, and 1 has no number
 LARGE = 2000  # entries from which a matrix is stored in eight bits
 
 
@@ -168,7 +168,7 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         predictor: parameters of the latent predictor.
         normalizers: scales of its codes and inputs.
     """
-    exact, scales = {CANDIDATES}, normalizers._asdict()
+    exact, scales = set(), normalizers._asdict()
     if isinstance(normalizers, ForceScales):
         del scales["whitening"]  # of the inverse Hessian, which must then be exact
         exact.add(HESSIAN)
@@ -212,8 +212,8 @@ def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
 
 def _normalizers(parts: dict[str, Any]) -> Normalizers | ForceScales:
     if "whitening" in parts:
-        arrays = dict(parts)
-        return ForceScales(whitening=Whitening(**arrays.pop("whitening")), **arrays)
+        arrays = {name: parts[name] for name in ForceScales._fields}
+        return ForceScales(**arrays | {"whitening": Whitening(**parts["whitening"])})
     return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
 
 
@@ -234,7 +234,7 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
             leaves = {name: file[name] for name in names}
             for name, leaf in leaves.items():
                 scale = file[f"{name}|scale"] if leaf.dtype == np.int8 else 1
-                leaves[name] = leaf if name == CANDIDATES else (leaf * scale).astype(np.float32)
+                leaves[name] = (leaf * scale).astype(np.float32)
         tree = checkpoint.nested(leaves)
         tree["phi"]["garment"]  # all else of a model needs it
         if config.stage2.forces:
@@ -245,7 +245,7 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
             "statistics": _statistics(tree["statistics"]),
             "normalizers": _normalizers(tree["normalizers"]),
         }
-    except damage.NewerFormat:
+    except damage.OtherFormat:
         raise
     except damage.UNREADABLE as error:
         raise ValueError(

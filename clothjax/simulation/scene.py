@@ -8,7 +8,7 @@ import numpy as np
 from clothjax.body import reach
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
-from clothjax.geometry.proximity import Patches, patches
+from clothjax.geometry.proximity import Clusters, Patches, clusters, patches
 from clothjax.types import Array, Body, Garment, Mesh
 
 
@@ -30,6 +30,7 @@ class Scene(NamedTuple):
     level: Array  # [V] int32, the deepest coarse level of a vertex, plus one; 0 for none
     tables: tuple[Table, ...]  # one a block of mesh convolution
     patches: Patches | None  # of the body
+    clusters: Clusters | None  # of the garment's vertices, and of the centroids of the body's faces
     garment_patches: Patches
 
     @property
@@ -65,6 +66,7 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
     )
     touchable = config.physics.body != "none"
     within = reach.reachable(body, garment, config.physics.reach) if touchable else _bare(body)
+    surface, body_faces = np.asarray(within.vertices), np.asarray(within.faces)
     return Scene(
         garment=garment,
         body=within,
@@ -73,7 +75,8 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
         graph=graph,
         level=mesh_hierarchy.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
-        patches=patches(np.asarray(within.vertices), np.asarray(within.faces)) if touchable else None,
+        patches=patches(surface, body_faces) if touchable else None,
+        clusters=clusters(garment.vertices, surface[body_faces].mean(axis=1)) if touchable else None,
         garment_patches=patches(np.asarray(garment.vertices), faces),
     )
 

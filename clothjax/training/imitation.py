@@ -46,12 +46,11 @@ class TrainingState(NamedTuple):
     garment: dict  # the frozen decoder and blend shapes; with them, a checkpoint is a complete Psi
 
 
-def blank(garment: dict, whitening: Whitening, candidates: np.ndarray, constants: int, config: Config) -> TrainingState:
+def blank(garment: dict, whitening: Whitening, constants: int, config: Config) -> TrainingState:
     """Return the state without any labels: its Psi holds the code.
 
     Args:
         garment: parameters of the decoder.
-        candidates: [V, K] int32, of `candidates.measure`.
         constants: number of the constant inputs.
     """
     latent = len(whitening.to)
@@ -61,9 +60,7 @@ def blank(garment: dict, whitening: Whitening, candidates: np.ndarray, constants
     params = params | {"linear": jax.tree.map(jnp.zeros_like, params["linear"])}
     far = jnp.full(latent, 1e6)
     whitening = jax.tree.map(jnp.array, whitening)
-    scales = ForceScales(
-        jnp.zeros(size), jnp.ones(size), jnp.float32(0.0), whitening, -far, jnp.array(far), jnp.asarray(candidates)
-    )
+    scales = ForceScales(jnp.zeros(size), jnp.ones(size), jnp.float32(0.0), whitening, -far, jnp.array(far))
     average = jax.tree.map(jnp.array, params)
     garment = jax.tree.map(jnp.array, garment)
     return TrainingState(jnp.int32(0), key, params, average, optimizer(config).init(params), scales, garment)
@@ -71,7 +68,7 @@ def blank(garment: dict, whitening: Whitening, candidates: np.ndarray, constants
 
 def first(state: TrainingState, labels: Labels, config: Config) -> TrainingState:
     """Return the state before the first training step: scales measured on the labels, the linear map by ridge."""
-    scales = measure(labels, state.normalizers.whitening, state.normalizers.candidates)
+    scales = measure(labels, state.normalizers.whitening)
     inputs, targets = (np.asarray(part, np.float64) for part in examples(labels, scales))
     weights = weight(targets)[:, None]
     bordered = np.concatenate([inputs, np.ones((len(inputs), 1))], axis=1)
@@ -82,7 +79,7 @@ def first(state: TrainingState, labels: Labels, config: Config) -> TrainingState
     return state._replace(params=params, average=jax.tree.map(jnp.array, params), normalizers=scales)
 
 
-def measure(labels: Labels, whitening: Whitening, candidates: Array) -> ForceScales:
+def measure(labels: Labels, whitening: Whitening) -> ForceScales:
     """Measure the scales of labels. Medians and quantiles: forces of contact have long tails."""
     inputs = _inputs(labels, whitening)
     middle = np.median(inputs, axis=0)
@@ -91,7 +88,7 @@ def measure(labels: Labels, whitening: Whitening, candidates: Array) -> ForceSca
     size = np.median(np.sqrt(np.mean(_changes(labels, whitening) ** 2, axis=1)))
     middle, spread, size = (jnp.asarray(x, jnp.float32) for x in (middle, spread, size))
     low, high = map(jnp.asarray, _range(labels))
-    return ForceScales(middle, spread, size, whitening, low, high, candidates)
+    return ForceScales(middle, spread, size, whitening, low, high)
 
 
 def room(labels: Labels, scales: ForceScales, config: Config) -> Data:

@@ -123,7 +123,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
             surface = characters.surface(scene, window.following)
-            pulls = forces.reduced(garment, held, step, surface, scales.candidates, scene.mesh, config.physics)
+            pulls = forces.reduced(garment, held, step, surface, scene.clusters, scene.mesh, config.physics)
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code, code + SAME * lag])

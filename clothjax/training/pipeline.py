@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 from clothjax import progress
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
-from clothjax.files import checkpoint, configuration, damage
+from clothjax.files import checkpoint, configuration
 from clothjax.material import configured_material
 from clothjax.networks import animators, forces
 from clothjax.networks.normalisation import ForceScales, Normalizers
@@ -27,7 +27,6 @@ from clothjax.progress import progress_bar
 from clothjax.simulation import assembly
 from clothjax.simulation.assembly import Experiment
 from clothjax.training import (
-    candidates,
     devices,
     fine_tuning,
     imitation,
@@ -204,7 +203,7 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     of = labels.fingerprint(settings_read, params)
     collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
     update = imitation.make_update(len(inverse), config, STEPS_PER_CALL, run.device_mesh)
-    state = imitation.blank(garment, whitening, _candidates(run, phi, of), len(constants), config)
+    state = imitation.blank(garment, whitening, len(constants), config)
     fitted, data, scales = loop.Fitted(state, 0.0, 0.0), None, state.normalizers
     simulations = labels.begin(scene, run.clips, config)
     folder.mkdir(parents=True, exist_ok=True)
@@ -237,23 +236,6 @@ def _label(run: Run, collect: Callable, psi: labels.Policy, simulations: pool.Si
         finished = collect(psi, simulations, settings.seed + number, report)
     _add_seconds(run, teacher_seconds=time.monotonic() - began)
     return finished
-
-
-def _candidates(run: Run, phi: loop.Fitted, of: int) -> np.ndarray:
-    """Return the candidates [V, K] of stage 2 with forces, from the run's folder if they are there."""
-    path = run.directory / "stage2" / f"candidates_{of}.npy"
-    if path.is_file():
-        try:
-            return np.load(path, allow_pickle=False)
-        except damage.UNREADABLE as error:
-            raise ValueError(f"{path}: not readable candidates ({error}); remove it to find them again") from error
-    model = {"params": phi.state.average, "statistics": phi.state.statistics}
-    with progress_bar("looking for what the cloth touches", run.config.labels.candidate_rollouts) as report:
-        found = candidates.measure(model, run.experiment.scene, run.clips, run.config, report, run.device_mesh)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with run_folder.whole(path) as file:
-        np.save(file, found)
-    return found
 
 
 def fine_tune(run: Run, phi: dict, psi: Psi) -> loop.Fitted:

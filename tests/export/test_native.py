@@ -285,7 +285,7 @@ def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path)
     arrays, path = list(native._arrays(forced["mesh"])), tmp_path / "g.psi"
     whole = native.as_bytes(arrays)
     tables = [i for i, array in enumerate(arrays) if array.dtype == np.int32 and array.ndim == 2]
-    assert len(tables) == 5  # corners, hinges, faces of the body, candidates, edges
+    assert len(tables) == 5  # corners, hinges, faces of the body, its clusters, edges
     wrong = [whole[:cut] for cut in np.linspace(100, len(whole) - 64, 40).astype(int)]
     for table in tables:
         for value in (-1, 1 << 18):

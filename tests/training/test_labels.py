@@ -18,7 +18,7 @@ from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import inference, loading, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
-from clothjax.training import candidates, imitation, labels, pipeline, pool, sampling, stage1
+from clothjax.training import imitation, labels, pipeline, pool, sampling, stage1
 from clothjax.training.labels import Round
 
 
@@ -30,17 +30,13 @@ def toy():
         config,
         motions=("walk_0", "dance_0"),
         stage2=dataclasses.replace(config.stage2, forces=True),
-        labels=LabelsConfig(
-            rounds=2, simulations=2, frames=5, candidate_rollouts=1, external=0.0, noise=0.0, steps=20, batch=8
-        ),
+        labels=LabelsConfig(rounds=2, simulations=2, frames=5, external=0.0, noise=0.0, steps=20, batch=8),
     )
     experiment = assembly.assemble(config)
     clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
     params = stage1.init(experiment.scene, clips, config).params
     whitening = forces.whitening(params["inverse_hessian"])
-    vertices = len(experiment.garment.vertices)
-    near = np.arange(vertices * 16, dtype=np.int32).reshape(vertices, 16) % len(experiment.scene.body.faces)
-    return experiment, clips, params, imitation.blank(params["garment"], whitening, near, 14, config)
+    return experiment, clips, params, imitation.blank(params["garment"], whitening, 14, config)
 
 
 @pytest.fixture(scope="module")
@@ -57,13 +53,9 @@ def problem(toy):
     return scene, config, lambda z: garment(latent=z), step, window, code
 
 
-def reduced(garment, code, step, window, scene, candidates, **physics):
+def reduced(garment, code, step, window, scene, **physics):
     surface = characters.surface(scene, window.following)
-    return forces.reduced(garment, code, step, surface, candidates, scene.mesh, PhysicsConfig(**physics))
-
-
-def all_faces(scene):
-    return np.broadcast_to(np.arange(len(scene.body.faces)), (len(scene.garment.vertices), len(scene.body.faces)))
+    return forces.reduced(garment, code, step, surface, scene.clusters, scene.mesh, PhysicsConfig(**physics))
 
 
 def test_simulations_of_labels_are_more_often_soft_or_stiff_in_all_respects(toy):
@@ -89,9 +81,9 @@ def test_simulations_of_labels_are_more_often_soft_or_stiff_in_all_respects(toy)
 
 @pytest.mark.parametrize("edges", [True, False])
 def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem, edges):
-    """Of all terms but friction and contact; with all faces as candidates, contact is a spring at HOOD's planes."""
+    """Of all terms but friction and contact; contact is a spring at HOOD's planes."""
     scene, config, garment, step, window, code = problem
-    kinds = reduced(garment, code, step, window, scene, jnp.asarray(all_faces(scene)), edge_contact=edges)
+    kinds = reduced(garment, code, step, window, scene, edge_contact=edges)
     held, body = np.asarray(garment(code)), window.following.body
     planes = contact_search.find_at_centroids(held, body, body, scene.body.faces)
     normals, raised = np.asarray(planes.normal_next), np.zeros(len(held))
@@ -115,23 +107,6 @@ def test_forces_are_minus_the_gradient_of_the_potential_that_is_felt(problem, ed
     terms = set(incremental_potential.energies(garment(code), step, scene.mesh, config.physics))
     felt = [name for names in forces.KINDS.values() for name in names]
     assert sorted(felt) == sorted(terms - {"friction", "edge_collision"})  # each once
-
-
-def test_a_vertex_feels_only_its_candidates(problem):
-    scene, _, garment, _, window, code = problem
-    held, body, faces = garment(code), window.following.body, jnp.asarray(scene.body.faces)
-    far = jnp.argmax(jnp.linalg.norm(held[:, None] - contact_search.centroids(body, faces)[0][None], axis=-1), axis=1)
-    none = jnp.zeros((1, 2), jnp.int32)  # an edge without length
-    contact = forces.felt(held, contact_search.centroids(body, faces), far[:, None].astype(jnp.int32), none)
-    np.testing.assert_array_equal(contact.point_next, contact_search.centroids(body, faces)[0][far])
-
-
-def test_candidates_are_what_comes_near_most_often():
-    faces = np.array([[0, 5], [0, 5], [1, 6], [2, 7]])
-    distances = np.array([[0.2, 0.2], [0.2, 0.01], [0.01, 0.2], [0.01, 0.2]])
-    found = candidates.most_frequent(faces, distances, 8, 4)
-    # the first vertex is near to 1 and 2; to 0 twice, but far
-    np.testing.assert_array_equal(found, [[1, 2, 0, 1], [5, 6, 7, 5]])
 
 
 def test_whitening_makes_the_mean_hessian_the_identity():
@@ -276,8 +251,7 @@ def test_a_simulation_feels_what_pushes_it_and_whether_its_body_moves(toy, monke
         window = characters.window(scene, character, poses)
         garment = partial(phi.decode, params["garment"], scene, character, window=window, config=config.model)
         step = time_step.time_step(scene, character, simulation.cloth, window, 1 / config.fps, config, external)
-        held, near = simulation.cloth.latent, blank.normalizers.candidates
-        return reduced(lambda z: garment(latent=z), held, step, window, scene, near)[0]
+        return reduced(lambda z: garment(latent=z), simulation.cloth.latent, step, window, scene)[0]
 
     still = motion_clips.standing(moves)
     mine, other = (still, moves) if stands else (moves, still)
@@ -339,7 +313,7 @@ def test_frames_of_several_rounds_are_learnt_from_and_widen_the_range_of_codes(t
 
 def test_examples_say_where_the_labels_go(toy, round_of):
     whitening = toy[3].normalizers.whitening
-    scales = imitation.measure(round_of, whitening, toy[3].normalizers.candidates)
+    scales = imitation.measure(round_of, whitening)
     _, targets = imitation.examples(round_of, scales)
     reached = round_of.code + float(scales.output) * targets @ np.asarray(whitening.back)
     np.testing.assert_allclose(reached, round_of.target, atol=1e-3 * np.abs(round_of.target).max())
@@ -389,10 +363,6 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
     first = pipeline.train_phi(whole)
     straight, _ = pipeline.train_force_psi(whole, first)
     assert int(straight.state.step) == 40
-    scene, near = whole.experiment.scene, straight.state.normalizers.candidates
-    centroids = np.asarray(scene.body.vertices)[scene.body.faces].mean(axis=1)
-    assert np.median(np.linalg.norm(centroids[near[:, 0]] - scene.garment.vertices, axis=-1)) < 0.1
-
     stopped = whole._replace(directory=tmp_path / "stopped")
     first = pipeline.train_phi(stopped)
     make_collect = labels.make_collect
