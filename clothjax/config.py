@@ -161,7 +161,7 @@ class ModelConfig:
     """What Phi's network gives: the next code, as in the thesis (`absolute`), or a correction added to a guess of it
     (`descent`). The guess starts at the current code, plus its last change if the potential is lower there, and takes
     `descent_steps` steps down the potential."""
-    descent_steps: int = 16
+    descent_steps: int = 32
     """Conjugate-gradient steps that find the guess."""
     descent_samples: int = 24
     """Rollouts of Phi, at whose last frames the Hessian of the potential by the code is evaluated. The mean Hessian
@@ -353,8 +353,8 @@ class LabelsConfig:
     """Frames by which a round moves a simulation."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
-    descent_steps: int = 20
-    """Most conjugate-gradient steps of a label. They start where Psi is, so that later rounds go on from earlier."""
+    descent_steps: int = 40
+    """Most descent steps of a label. They start where Psi is, so that later rounds go on from earlier."""
     tolerance: float = 1e-4
     """Share of the energy gained that a label may leave."""
     shares: tuple[float, ...] = (0.3, 0.7, 0.9, 1.0, 1.0)

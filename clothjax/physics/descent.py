@@ -1,4 +1,4 @@
-"""Descent of the potential by preconditioned nonlinear conjugate gradients (METHOD.md, Descent)."""
+"""Descent of the potential by L-BFGS (METHOD.md, Descent; Nocedal & Wright, Numerical Optimization, algorithm 7.4)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,84 +9,120 @@ import jax.numpy as jnp
 from clothjax.types import Array
 
 COLUMNS = 32  # columns of a Hessian that are computed together
-MAX_LENGTH = 4.0  # longest step, where 1 is right for the configured cloth at rest: others are softer or lighter
+MEMORY = 16  # steps from which the curvature is known
+SUFFICIENT = 1e-4  # share of what the slope promises that a step must gain (Armijo)
+SHORTER = (0.1, 0.5)  # least and greatest share of a step that is tried after one that gained too little
+SCALE = (0.05, 20.0)  # least and greatest scale of the preconditioner, of the curvature of the last step
+ROUNDING = 1e-7  # of an energy, relative
 
 
 class _Iterate(NamedTuple):
     """A descent after some steps."""
 
     latent: Array  # [L]
-    direction: Array  # [L] of the last step
-    gradient: Array  # [L] where that step began
-    steepest: Array  # [L] minus the preconditioned gradient there
-    energy: Array  # J, there
+    energy: Array  # J
+    gradient: Array  # [L]
+    direction: Array  # [L] to the code that is tried next, and ...
+    share: Array  # ... how far to go along it
+    moves: Array  # [M, L] changes of the code, newest first, ...
+    turns: Array  # [M, L] ... of the gradient, and ...
+    weights: Array  # [M] ... one over their products; 0 for no step
 
 
-def _step(
-    last: _Iterate,
-    precondition: Callable[[Array], Array],
-    garment: Callable[[Array], Array],
-    potential: Callable[[Array], Array],
-    bound: float,
-) -> _Iterate:
-    """Take one step of `descend`."""
-    x, pullback = jax.vjp(garment, last.latent)
-    energy, force = jax.value_and_grad(potential)(x)
-    new = pullback(force)[0]
-    down = -precondition(new)
-    beta = jnp.sum(new * (last.steepest - down)) / jnp.maximum(-jnp.sum(last.gradient * last.steepest), 1e-12)
-    direction = down + jnp.maximum(beta, 0.0) * last.direction
-    direction = jnp.where(jnp.sum(new * direction) < 0, direction, down)
-    _, moved = jax.jvp(garment, (last.latent,), (direction,))
-    # forwards twice: the product with the Hessian takes twice as long
-    _, curvature = jax.jvp(lambda y: jax.jvp(potential, (y,), (moved,))[1], (x,), (moved,))
-    slope = jnp.maximum(-jnp.sum(moved * force), 0.0)
-    convex = curvature > 0
-    length = jnp.where(convex, jnp.minimum(slope / jnp.where(convex, curvature, 1.0), MAX_LENGTH), 1.0)
-    push = jnp.where(slope > 0, length, 0.0) * direction
+Precondition = Callable[[Array], Array]
+Objective = Callable[[Array], tuple[Array, Array]]
+
+
+def _direction(at: _Iterate, precondition: Precondition, bound: float) -> Array:
+    """Return the quasi-Newton direction [L], no longer than `bound`."""
+
+    def backward(rest: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        move, turn, weight = step
+        along = weight * jnp.sum(move * rest)
+        return rest - along * turn, along
+
+    def forward(new: Array, step: tuple[tuple[Array, Array, Array], Array]) -> tuple[Array, None]:
+        (move, turn, weight), along = step
+        return new + (along - weight * jnp.sum(turn * new)) * move, None
+
+    steps = (at.moves, at.turns, at.weights)
+    rest, along = jax.lax.scan(backward, at.gradient, steps)
+    turn = at.turns[0]
+    scale = jnp.sum(at.moves[0] * turn) / jnp.maximum(jnp.sum(turn * precondition(turn)), 1e-20)
+    scale = jnp.where(at.weights[0] > 0, jnp.clip(scale, *SCALE), 1.0)
+    new, _ = jax.lax.scan(forward, scale * precondition(rest), (steps, along), reverse=True)
+    new = jnp.where(jnp.sum(new * at.gradient) > 0, new, precondition(at.gradient))
     # deep collisions push thousands of times harder than the rest
-    push = push / jnp.sqrt(1.0 + jnp.sum(push * push) / bound**2)
-    return _Iterate(last.latent + push, direction, new, down, energy)
+    return -new / jnp.sqrt(1.0 + jnp.sum(new * new) / bound**2)
 
 
-def _first(latent: Array) -> _Iterate:
-    zero = jnp.zeros_like(latent)
-    return _Iterate(latent, zero, zero, zero, jnp.zeros((), latent.dtype))
+def _first(latent: Array, objective: Objective, precondition: Precondition, bound: float) -> _Iterate:
+    """Return the descent before its first step."""
+    energy, gradient = objective(latent)
+    steps = jnp.zeros((MEMORY, len(latent)), latent.dtype)
+    one = jnp.ones((), latent.dtype)
+    first = _Iterate(latent, energy, gradient, gradient, one, steps, steps, steps[:, 0])
+    return first._replace(direction=_direction(first, precondition, bound))
+
+
+def _step(last: _Iterate, objective: Objective, precondition: Precondition, bound: float) -> _Iterate:
+    """Try one step: take it if the energy falls enough, else try a shorter one next."""
+    tried = last.latent + last.share * last.direction
+    energy, gradient = objective(tried)
+    slope = last.share * jnp.sum(last.gradient * last.direction)
+    falls = energy <= last.energy + SUFFICIENT * slope + ROUNDING * jnp.abs(last.energy)
+    move, turn = tried - last.latent, gradient - last.gradient
+    curvature = jnp.sum(move * turn)
+    convex = falls & (curvature > 1e-10 * jnp.sqrt(jnp.sum(move * move) * jnp.sum(turn * turn)))
+
+    def remembered(rows: Array, row: Array) -> Array:
+        return jnp.where(convex, jnp.concatenate([row[None], rows[:-1]]), rows)
+
+    there = _Iterate(
+        *(jnp.where(falls, *x) for x in ((tried, last.latent), (energy, last.energy), (gradient, last.gradient))),
+        last.direction,
+        last.share,
+        remembered(last.moves, move),
+        remembered(last.turns, turn),
+        remembered(last.weights, 1.0 / jnp.where(convex, curvature, 1.0)),
+    )
+    # the minimum of the parabola through both energies and the slope
+    shorter = jnp.clip(-slope / (2.0 * jnp.maximum(energy - last.energy - slope, 1e-20)), *SHORTER)
+    shorter = last.share * jnp.where(jnp.isfinite(energy), shorter, SHORTER[0])
+    return there._replace(
+        direction=jnp.where(falls, _direction(there, precondition, bound), last.direction),
+        share=jnp.where(falls, 1.0, shorter),
+    )
 
 
 def descend(
-    precondition: Callable[[Array], Array],
+    precondition: Precondition,
     latent: Array,
     garment: Callable[[Array], Array],
     potential: Callable[[Array], Array],
     steps: int,
     bound: float,
 ) -> Array:
-    """Take conjugate-gradient steps (Polak-Ribiere) from a code [L] down the potential of its garment.
-
-    The length of a step is Newton's along its direction, from the local curvature of the potential. Cloth that rests
-    on the body is stiffer than cloth at rest, and longer steps would throw it off.
+    """Take steps of L-BFGS from a code [L] down the potential of its garment; the energy never rises.
 
     Args:
         precondition: from a gradient [L] to an approximate inverse Hessian times it.
         latent: [L], the first code.
         garment: from a code to vertices [V, 3] m.
         potential: from vertices to J.
-        steps: number of steps.
+        steps: number of steps that are tried, each for one gradient.
         bound: length that no step exceeds.
 
     Returns:
         The last code [L].
     """
-
-    iterate, _ = jax.lax.scan(
-        lambda last, _: (_step(last, precondition, garment, potential, bound), None), _first(latent), None, length=steps
-    )
-    return iterate.latent
+    objective = jax.value_and_grad(lambda code: potential(garment(code)))
+    first = _first(latent, objective, precondition, bound)
+    return jax.lax.scan(lambda at, _: (_step(at, objective, precondition, bound), None), first, length=steps)[0].latent
 
 
 def converge(
-    precondition: Callable[[Array], Array],
+    precondition: Precondition,
     latent: Array,
     garment: Callable[[Array], Array],
     potential: Callable[[Array], Array],
@@ -98,25 +134,26 @@ def converge(
 
     Args:
         steps: most steps.
-        tolerance: half of g^T P g that ends the descent, as a share of the energy gained so far, plus as much of 10 mJ.
+        tolerance: half of the slope along the direction that ends the descent, as a share of the energy gained so far,
+            plus as much of 10 mJ.
 
     Returns:
         The last code [L], and the number of steps.
     """
-    began = potential(garment(latent))
+    objective = jax.value_and_grad(lambda code: potential(garment(code)))
+    first = _first(latent, objective, precondition, bound)
 
-    def goes_on(carry):
-        iterate, count = carry
-        left = -0.5 * jnp.sum(iterate.gradient * iterate.steepest)
-        gained = jnp.maximum(began - iterate.energy, 0.0)
-        return (count < steps) & ((count < 2) | (left > tolerance * (gained + 0.01)))
+    def goes_on(carry: tuple[_Iterate, Array]) -> Array:
+        at, count = carry
+        left = -0.5 * jnp.sum(at.gradient * at.direction)
+        return (count < steps) & ((count < 2) | (left > tolerance * (first.energy - at.energy + 0.01)))
 
-    def step(carry):
-        iterate, count = carry
-        return _step(iterate, precondition, garment, potential, bound), count + 1
+    def step(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:
+        at, count = carry
+        return _step(at, objective, precondition, bound), count + 1
 
-    iterate, count = jax.lax.while_loop(goes_on, step, (_first(latent), jnp.int32(0)))
-    return iterate.latent, count
+    at, count = jax.lax.while_loop(goes_on, step, (first, jnp.int32(0)))
+    return at.latent, count
 
 
 def warm_start(

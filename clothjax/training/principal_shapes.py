@@ -56,7 +56,7 @@ def simulate(
 ) -> np.ndarray:
     """Simulate cloth on random clips, bodies and materials: canonical displacements [N, T, V, 3] m.
 
-    Each step is a few conjugate-gradient steps of all vertices down the potential that trains Phi. Sequences that
+    Each step is a few steps of L-BFGS of all vertices down the potential that trains Phi. Sequences that
     diverged are left out.
 
     Args:

@@ -29,7 +29,7 @@ from experiments.benchmark.timing import Call
 matplotlib.use("Agg")
 
 PAPER = ["configs/paper_tshirt.yaml"]
-SHIPPED, FINE, FORCED = "tshirt", "tshirt_4000", "skirt"
+SHIPPED, FINE, FORCED = "tshirt_pose", "tshirt_4000", "tshirt"
 FRAMES = 300
 WARM = 3  # calls in a row of which the last is timed: what a game that draws nothing else would see
 CROWDS = (1, 4, 16, 64, 256, 1024)

@@ -31,7 +31,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 FAMILIES = ("walk", "run", "arms")
-SKIRT, TSHIRT, DRESS = (trained.find(name) for name in ("skirt", "tshirt", "dress"))
+SKIRT, TSHIRT, DRESS = (trained.find(name) for name in ("skirt", "tshirt_pose", "dress"))
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_phi_frame_by_frame_is_phi_all_at_once(clips):
 def test_a_crowd_wears_what_is_chosen(clips):
     show = live.Show(clips, FAMILIES, SKIRT)
     show.dress(TSHIRT, np.linspace(-1, 1, 4), Material(0.2, 3e4, 2e4, 1e-4), count=6)
-    template = cj.load("tshirt", betas=np.append(np.linspace(-1, 1, 4), np.zeros(6))).wearer.template
+    template = cj.load("tshirt_pose", betas=np.append(np.linspace(-1, 1, 4), np.zeros(6))).wearer.template
     np.testing.assert_allclose(show.outfit.model.wearer.template, template, atol=1e-6)
     show.steering.faster()
     show.steering.turn(np.pi)
@@ -213,7 +213,7 @@ def test_the_panel_reaches_what_is_shown(viewer):
     assert viewer.wind.visible
     viewer.wind.value = 5.0
     assert viewer.show.steering.wind == 5.0
-    viewer.garment.value = "tshirt"
+    viewer.garment.value = "tshirt_pose"
     viewer.run(1)
     assert not viewer.wind.visible
     viewer.garment.value, viewer.wind.value = "skirt", 0.0

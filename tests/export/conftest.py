@@ -10,7 +10,7 @@ from clothjax.types import Motion
 
 @pytest.fixture(scope="module")
 def model():
-    return cj.load("tshirt", betas=np.linspace(-1, 1, 10))
+    return cj.load("tshirt_pose", betas=np.linspace(-1, 1, 10))
 
 
 @pytest.fixture(scope="module")

@@ -240,7 +240,7 @@ def test_litert_agrees_over_300_frames(model, tmp_path):
     subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True)
     for int8, most in (((), 0.1), (("--int8",), 2.0)):
         out = tmp_path / "t.tflite"
-        command = [python, "-m", "clothjax", "convert", "tshirt", "--to", "litert", "--out", out, *int8]
+        command = [python, "-m", "clothjax", "convert", "tshirt_pose", "--to", "litert", "--out", out, *int8]
         subprocess.run(command, check=True, cwd=root)
         told = json.loads(out.with_suffix(".json").read_text())
         assert told["distance_to_jax"]["frames"] == 300 and 0 < told["distance_to_jax"]["max_mm"] < most
@@ -412,7 +412,7 @@ def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 40)
     out = tmp_path / "s.onnx"
-    convert.main(["tshirt", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
+    convert.main(["tshirt_pose", "--to", "onnx", "--int8", "--betas", "1", "--out", str(out)])
     told = json.loads(out.with_suffix(".json").read_text())
     assert told["betas"] == [1.0] and 0 < told["distance_to_jax"]["mean_mm"] < 1
     assert "over 40 frames of autoregressive rollout" in capsys.readouterr().out

@@ -368,7 +368,7 @@ def frames(motion, path, count):
 def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 20)
     out = tmp_path / "engine" / "tshirt.psi"
-    convert.main(["tshirt", "--to", "c", "--out", str(out)])
+    convert.main(["tshirt_pose", "--to", "c", "--out", str(out)])
     assert "over 20 frames of autoregressive rollout" in capsys.readouterr().out
     shutil.copy(PLAY, out.parent)
     program = out.parent / "play"
@@ -388,7 +388,7 @@ def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, cap
     done = subprocess.run([program, out, given, tmp_path / "vertices.bin"], check=True, capture_output=True, text=True)
     assert done.stdout.endswith("us a frame, one thread\n")
     found = np.fromfile(tmp_path / "vertices.bin", np.float32).reshape(30, -1, 3)
-    tshirt = rounded(specialise.specialise(cj.load("tshirt")))
+    tshirt = rounded(specialise.specialise(cj.load("tshirt_pose")))
     short = motion._replace(rotations=motion.rotations[:30], translation=motion.translation[:30])
     assert apart(found, tshirt, short).max() < 3e-5
     for broken, why in ((given, "not a .psi of this version"), (tmp_path / "none.psi", "cannot be opened")):

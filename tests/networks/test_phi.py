@@ -51,8 +51,8 @@ def test_the_descent_begins_where_the_code_is_going_unless_that_is_worse(coded):
     np.testing.assert_array_equal(descent.warm_start(START, jnp.full(3, jnp.nan), decode, potential), START)
 
 
-def test_steps_are_conjugate():
-    """Without a preconditioner, as many steps as there are codes reach the minimum of an uneven quadratic."""
+def test_steps_learn_the_curvature():
+    """Without a preconditioner, on an uneven quadratic: each step tells of a direction, three tell of all."""
     weights = jnp.array([1.0, 30.0, 400.0])
 
     def potential(positions):
@@ -63,9 +63,9 @@ def test_steps_are_conjugate():
 
     def left(steps):
         done = descend(jnp.eye(3), START, decode, potential, steps)
-        return float(jnp.linalg.norm(done - GOAL))
+        return float(potential(decode(done)) / potential(decode(START)))
 
-    assert left(3) < 1e-3 * left(2)
+    assert left(8) < 0.1 and left(20) < 1e-6
 
 
 def test_no_step_overshoots_what_the_hessian_does_not_know(coded):
@@ -95,9 +95,25 @@ def test_where_the_potential_has_no_minimum_or_is_at_one(coded):
     np.testing.assert_array_equal(uphill, START)
 
 
-def test_a_softer_cloth_goes_farther(coded):
+@pytest.mark.parametrize("softer", [3.0, 0.5, 15.0, 400.0])
+def test_a_softer_or_a_stiffer_cloth_shows_in_the_first_step(coded, softer):
     inverse, decode, potential = coded
-    done = descend(inverse, START, decode, lambda x: potential(x) / 3)
-    np.testing.assert_allclose(done, GOAL, atol=1e-4)
-    done = descend(inverse, START, decode, lambda x: potential(x) / 400)
-    np.testing.assert_allclose(done - START, descent.MAX_LENGTH / 400 * (GOAL - START), rtol=1e-3)
+    done = descend(inverse, START, decode, lambda x: potential(x) / softer, 4)
+    np.testing.assert_allclose(done, GOAL, atol=1e-3)
+
+
+def test_no_step_goes_where_there_is_no_energy(coded):
+    """A potential that is not finite past a plane, which lies between the start and what the first step tries."""
+    inverse, decode, potential = coded
+    half = float(0.5 * (START[0] + GOAL[0]))
+
+    def walled(positions):
+        first = jnp.einsum("vc,kvc->k", positions, jax.jacobian(decode)(START).transpose(2, 0, 1))
+        return jnp.where(jnp.linalg.solve(gram, first)[0] < half, potential(positions), jnp.nan)
+
+    shapes = jax.jacobian(decode)(START)  # [V, 3, K]
+    gram = jnp.einsum("vck,vcl->kl", shapes, shapes)
+    ends = [descend(inverse, START, decode, walled, steps) for steps in (1, 2, 4, 8, 30)]
+    energies = [float(walled(decode(z))) for z in (START, *ends)]
+    assert np.isfinite(energies).all() and energies == sorted(energies, reverse=True)
+    assert energies[-1] < 0.3 * energies[0]  # a quarter of it is at the plane

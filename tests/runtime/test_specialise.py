@@ -58,7 +58,7 @@ def test_a_folded_code_is_held_to_what_its_range_becomes(wide, motion):
 
 
 def test_a_code_as_wide_as_its_readers_stays():
-    model = cj.load("tshirt")
+    model = cj.load("tshirt_pose")
     folded = specialise.specialise(model)
     assert folded.network.predictor.code.kernel is not None
     # no finger and no foot moves a t-shirt
@@ -69,13 +69,13 @@ def test_a_code_as_wide_as_its_readers_stays():
 
 
 def test_exact_folds_of_a_shipped_garment(motion):
-    model = cj.load("tshirt", betas=np.linspace(-1, 1, 10))
+    model = cj.load("tshirt_pose", betas=np.linspace(-1, 1, 10))
     assert apart(model, specialise.specialise(model), motion).max() < 1e-5
 
 
 @pytest.mark.parametrize("kind", ["skip", "relu"])
 def test_fewer_blend_shapes_err_less_the_more_there_are(kind, wide, motion):
-    model = cj.load("tshirt") if kind == "skip" else wide
+    model = cj.load("tshirt_pose") if kind == "skip" else wide
     clip = Motion(motion.rotations[:100], motion.translation[:100], motion.fps)
     all_of_them = len(model.network.shapes)
     errors = []
@@ -101,7 +101,7 @@ def test_a_specialised_model_keeps_its_shapes(wide):
 
 
 def test_influences_are_the_largest_and_make_up_one(motion):
-    model = cj.load("tshirt")
+    model = cj.load("tshirt_pose")
     for count in (1, 4):
         fewer = specialise.specialise(model, max_influences=count).network.weights
         assert (np.count_nonzero(fewer, axis=0) <= count).all()
@@ -112,7 +112,7 @@ def test_influences_are_the_largest_and_make_up_one(motion):
 
 
 def test_a_part_of_a_garment_is_that_part(motion):
-    model = cj.load("tshirt")
+    model = cj.load("tshirt_pose")
     vertices = np.flatnonzero(model.wearer.template[1] > np.median(model.wearer.template[1]))
     upper = specialise.part(model, vertices)
     clip = Motion(motion.rotations[:20], motion.translation[:20], motion.fps)
@@ -125,7 +125,7 @@ def test_a_part_of_a_garment_is_that_part(motion):
 
 def test_a_finer_mesh_moves_with_the_model_and_its_own_mesh_not_at_all(motion):
     betas = np.linspace(-1, 1, 10)
-    model = cj.load("tshirt", betas=betas)
+    model = cj.load("tshirt_pose", betas=betas)
     clip = Motion(motion.rotations[:20], motion.translation[:20], motion.fps)
     body = storage.load_body(model.config.body)
     same = specialise.on_mesh(model, storage.load_garment("tshirt_1000", body), betas)
@@ -154,7 +154,7 @@ def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
 
 def test_fewer_shapes_bear_eight_bits():
     """Their coordinates do not cancel each other: rounding them does not hurt more than leaving shapes out."""
-    model = loading.load("tshirt")
+    model = loading.load("tshirt_pose")
     clip = storage.load_motion("walk_3", model.names)
     motion = Motion(clip.rotations[:60], clip.translation[:60].astype(np.float32), clip.fps)
     for count in (192, 64):
