@@ -162,7 +162,7 @@ class ModelConfig:
     (`descent`). The guess starts at the current code, plus its last change if the potential is lower there, and takes
     `descent_steps` steps down the potential."""
     descent_steps: int = 32
-    """Conjugate-gradient steps that find the guess."""
+    """Steps of L-BFGS that find the guess."""
     descent_samples: int = 24
     """Rollouts of Phi, at whose last frames the Hessian of the potential by the code is evaluated. The mean Hessian
     preconditions the descent. 0: the Hessian of the garment at rest takes its place."""
