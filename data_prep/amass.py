@@ -1,22 +1,28 @@
 """Motions of AMASS (SMPL-H and SMPL-X layouts), for any body with CMU's or SMPL's joint names.
 
     python -m data_prep.amass 01_01_poses.npz out.h5 --body body.h5 --fps 30
+    python -m data_prep.amass --list configs/thesis/takes.yaml AMASS_FOLDER OUT_FOLDER --body body.h5
+
+The second writes a file for each take of CMU's in the list, such as `OUT_FOLDER/cmu_07_02.motion.h5`.
 
 SMPL's poses are relative to a T-pose, so the skeleton of the recorded person is not needed. Hands and toes stay still.
 Poses may be axis-angle, quaternions, matrices or their first two columns (6D). The files have z up; others show that by
 how their figures stand.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
+from clothjax.files import configuration
 from clothjax.files.damage import UNREADABLE
 from clothjax.files.storage import Rig, canonical_rotation, load_rig
+from clothjax.progress import progress_bar
 from clothjax.types import Motion
 from data_prep import skeleton
 from data_prep.doubts import FASTEST, ground
@@ -26,6 +32,7 @@ from data_prep.rest_pose import AXES, UPRIGHT, turn_upright
 from data_prep.retarget import FROZEN, from_t_pose, leg_length, stand
 from data_prep.skeleton import cmu_names
 from data_prep.smpl import BODY
+from data_prep.takes import Takes, find
 
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 HIGHEST = 10.0  # m, of a pelvis whose path is in metres
@@ -219,11 +226,14 @@ def retarget_amass(
 
 @dataclass(frozen=True)
 class Arguments(MotionOptions):
-    """Retarget a motion of AMASS onto a body."""
+    """Retarget a motion of AMASS, or those of a list, onto a body."""
 
     motion: tyro.conf.Positional[Path]
-    """.npz as published."""
+    """.npz as published; with --list the folder of AMASS."""
     output: tyro.conf.Positional[Path]
+    """File to write; with --list the folder of the files."""
+    list: Path | None = None
+    """YAML file of CMU's takes, such as configs/thesis/takes.yaml."""
     up: Axis | None = None
     """Axis of the file that points up; it is the one along which the figures stand unless given."""
     allow: bool = False
@@ -235,14 +245,62 @@ class Arguments(MotionOptions):
 
 
 def main(args: Arguments) -> None:
-    """Write the motion file, and print which frames are implausible."""
+    """Write the motion file, or those of a list, and print which frames are implausible."""
+    if args.list is None:
+        convert(args.motion, args.output, args)
+    else:
+        convert_list(args.list, args)
+
+
+def convert(recording: Path, output: Path, args: Arguments) -> int:
+    """Write the motion file of a recording, print which frames are implausible, and return the number of frames.
+
+    Raises:
+        ValueError: as `read_amass`, `retarget_amass` and `mend`.
+    """
 
     def tell(line: str) -> None:
-        print(f"{args.motion}: {line}")
+        tqdm.write(f"{recording}: {line}")
 
-    capture = read_amass(args.motion, args.up, args.units, args.allow, tell)
+    capture = read_amass(recording, args.up, args.units, args.allow, tell)
     motion, rig = retarget_amass(capture, args.body, fps=args.fps, leg=args.leg, freeze=args.freeze, tell=tell)
-    write_motion(args.output, motion, rig, args.motion, args)
+    return write_motion(output, motion, rig, recording, args)
+
+
+def convert_list(path: Path, args: Arguments) -> None:
+    """Write the motion files of the takes in a list, and print how many takes and frames each kind has.
+
+    Raises:
+        ValueError: for a list, body or folder that is wrong; after all other takes, naming those that are missing or
+            refused.
+    """
+    takes = configuration.load(Takes, path)
+    load_rig(args.body)  # a wrong body is refused once, not with every take
+    files = find(args.motion, takes.all, tqdm.write)
+    frames: dict[str, int] = {}
+    failed: dict[str, list[str]] = {}  # takes by the reason
+    with progress_bar("takes", len(takes.all)) as report:
+        for done, take in enumerate(takes.all, start=1):
+            try:
+                if take not in files:
+                    raise ValueError(f"not in {args.motion} as SUBJECT/TAKE_poses.npz or SUBJECT/TAKE_stageii.npz")
+                frames[take] = convert(files[take], args.output / f"cmu_{take}.motion.h5", args)
+            except ValueError as error:
+                failed.setdefault(str(error), []).append(take)
+            report(done)
+
+    def count(kind: str, listed: Sequence[str]) -> str:
+        there = [frames[take] for take in listed if take in frames]
+        return f"{kind}: {len(there)} of {len(listed)} takes, {sum(there)} frames"
+
+    for kind, listed in takes.train.items():
+        print(count(kind, listed))
+    total = count("train", [take for listed in takes.train.values() for take in listed])
+    print(total if takes.frames is None else f"{total}; the list states {takes.frames} at 30 frames per second")
+    print(count("test", takes.test))
+    if failed:
+        reasons = "; ".join(f"{', '.join(of_reason)}: {reason}" for reason, of_reason in failed.items())
+        raise ValueError(f"{len(takes.all) - len(frames)} of {len(takes.all)} takes are not converted: {reasons}")
 
 
 if __name__ == "__main__":

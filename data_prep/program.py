@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from tqdm import tqdm
 
 from clothjax import cli
 from clothjax.files.storage import Rig, save_motion
@@ -140,8 +141,10 @@ def draw(path: Path, surfaces: list[ray_cast.Surface], around: np.ndarray, margi
         print(f"{path}: not drawn ({error})")
 
 
-def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: OutputOptions) -> None:
+def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: OutputOptions) -> int:
     """Treat the implausible frames of a motion as asked, save it, and print which frames they are.
+
+    Lines go above a progress bar, if there is one.
 
     Args:
         output: file to write.
@@ -149,10 +152,17 @@ def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, option
         rig: body and joint names.
         recording: file that the motion is from; names the motion.
         options: of the program.
+
+    Returns:
+        The number of frames that are saved.
+
+    Raises:
+        ValueError: as `mend`.
     """
     motion, report = mend(motion, rig.body, options.bad)
     name = recording.name.partition(".")[0]
     save_motion(output, motion, rig.names, name=name, source=recording.name, licence=options.licence)
     for doubt in doubts(motion, rig.body, rig.names):
-        print(f"{recording}: {doubt}")
-    print(f"{output}: {len(motion.translation)} frames, {report}")
+        tqdm.write(f"{recording}: {doubt}")
+    tqdm.write(f"{output}: {len(motion.translation)} frames, {report}")
+    return len(motion.translation)
