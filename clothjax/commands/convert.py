@@ -60,7 +60,7 @@ def main(argv: list[str]) -> None:
     model = loading.load(run, betas=betas, material=material)
     form = FORMATS[arguments.to]
     shipped = arguments.model in trained.shipped()
-    out = arguments.out or (Path(".") if shipped else run) / f"{model.config.garment}.{form.suffix}"
+    out = arguments.out or (Path(".") if shipped else run) / f"{Path(model.config.garment).stem}.{form.suffix}"
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
     error = formats.export(model, arguments.to, out, options, about, validation(model))
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
