@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 from scipy.spatial.transform import Rotation
 
 from clothjax.body.joint_names import CMU_FROM_SMPL
 from clothjax.body.plausibility import body_kinematics, kinematics
 from clothjax.files import storage
 from clothjax.types import Motion
-from data_prep import procedural
+from data_prep import procedural, skeleton
 from data_prep.smpl import BODY
 
 FINE = 600  # Hz, of which every usual rate is a part
@@ -207,6 +208,55 @@ def smpl_poses(kind: str, seed: int, fps: int) -> tuple[np.ndarray, np.ndarray]:
     local = turned_from.copy()
     local[:, 1:] = np.swapaxes(turned_from[:, short.parents[1:]], -1, -2) @ turned_from[:, 1:]
     return local[:, [short.names.index(name) for name in OF_SMPL]], taken.places[:, 0]
+
+
+def amass_arrays(kind: str, seed: int, fps: int = 120) -> dict:
+    """That motion as the arrays of a file of AMASS in SMPL-H's layout, up in z."""
+    turns, path = smpl_poses(kind, seed, fps)
+    up = Rotation.from_euler("x", 90, degrees=True).as_matrix()  # +y becomes +z
+    turns[:, 0] = up @ turns[:, 0]
+    poses = np.zeros((len(path), 52, 3))
+    poses[:, : len(BODY)] = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(len(path), -1, 3)
+    return {
+        "poses": poses.reshape(len(path), -1),
+        "trans": path @ up.T,
+        "betas": np.zeros(16),
+        "gender": np.array("female"),
+        "mocap_framerate": np.array(float(fps)),
+    }
+
+
+def smpl_model() -> dict:
+    """The embedded body in a T-pose as the arrays of a model of SMPL."""
+    body, names = storage.load_rig("body")
+    parents, turned_from = np.asarray(body.parents), storage.canonical_rotation("body")
+    local = turned_from.copy()
+    local[1:] = np.swapaxes(turned_from[parents[1:]], -1, -2) @ turned_from[1:]
+    motion = Motion(local[None], np.zeros((1, 3)), 30.0)
+    joints = body_kinematics(motion, body)[1][0]
+    moved = joints - np.einsum("jab,jb->ja", turned_from, body.joints)
+    blended = np.einsum("vj,jab->vab", body.weights, turned_from)
+    vertices = np.einsum("vab,vb->va", blended, body.vertices) + body.weights @ moved
+    kept = [names.index(name) for name in (*OF_SMPL, "LeftFingerBase", "RightFingerBase")]
+    nearest = [next(above for above in skeleton.ancestors(j, parents) if above in kept) for j in range(len(names))]
+    weights = np.zeros((len(vertices), len(kept)))
+    for joint, above in enumerate(nearest):
+        weights[:, kept.index(above)] += body.weights[:, joint]
+    regressor = np.zeros((len(kept), len(vertices)))
+    for row, joint in zip(regressor, joints[kept]):
+        near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:60]
+        row[near] = np.linalg.lstsq(np.c_[vertices[near], np.ones(60)].T, np.r_[joint, 1.0])[0]
+    table = np.array([[0, *(kept.index(nearest[parents[j]]) for j in kept[1:])], range(len(kept))])
+    table[0, 0] = 2**32 - 1
+    return {
+        "v_template": vertices,
+        "f": np.asarray(body.faces, np.uint32),
+        "weights": weights,
+        "shapedirs": np.einsum("vab,vbs->vas", blended, body.shapedirs),
+        "posedirs": np.zeros((len(vertices), 3, 9 * (len(kept) - 1))),
+        "J_regressor": scipy.sparse.csc_matrix(regressor),
+        "kintree_table": table,
+    }
 
 
 # Files
