@@ -163,7 +163,7 @@ class Clusters(NamedTuple):
     points: Array  # [P, GIVEN] int32, every point
 
 
-def clusters(positions: np.ndarray, points: np.ndarray) -> Clusters:
+def clusters(positions: Array, points: Array) -> Clusters:
     """Divide positions [V, 3] m and points [N, 3] m, as they lie in the canonical pose, into clusters of neighbours."""
     size = max(1, min(ASKED, BESIDE * len(positions) // len(points)))
     both = ((np.asarray(positions), size), (np.asarray(points), GIVEN))

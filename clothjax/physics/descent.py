@@ -78,13 +78,13 @@ def _step(last: _Iterate, objective: Objective, precondition: Precondition, boun
     def remembered(rows: Array, row: Array) -> Array:
         return jnp.where(convex, jnp.concatenate([row[None], rows[:-1]]), rows)
 
-    there = _Iterate(
-        *(jnp.where(falls, *x) for x in ((tried, last.latent), (energy, last.energy), (gradient, last.gradient))),
-        last.direction,
-        last.share,
-        remembered(last.moves, move),
-        remembered(last.turns, turn),
-        remembered(last.weights, 1.0 / jnp.where(convex, curvature, 1.0)),
+    there = last._replace(
+        latent=jnp.where(falls, tried, last.latent),
+        energy=jnp.where(falls, energy, last.energy),
+        gradient=jnp.where(falls, gradient, last.gradient),
+        moves=remembered(last.moves, move),
+        turns=remembered(last.turns, turn),
+        weights=remembered(last.weights, 1.0 / jnp.where(convex, curvature, 1.0)),
     )
     # the minimum of the parabola through both energies and the slope
     shorter = jnp.clip(-slope / (2.0 * jnp.maximum(energy - last.energy - slope, 1e-20)), *SHORTER)

@@ -212,8 +212,8 @@ def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
 
 def _normalizers(parts: dict[str, Any]) -> Normalizers | ForceScales:
     if "whitening" in parts:
-        arrays = {name: parts[name] for name in ForceScales._fields}
-        return ForceScales(**arrays | {"whitening": Whitening(**parts["whitening"])})
+        arrays = {name: parts[name] for name in ForceScales._fields if name != "whitening"}  # older ones have more
+        return ForceScales(whitening=Whitening(**parts["whitening"]), **arrays)
     return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
 
 
