@@ -714,17 +714,20 @@ static uint32_t following(const int32_t *key, int32_t count, int32_t last) {
     return least;
 }
 
-/* Compares positions [3][NEIGHBOURS] with the faces of a cluster, whose first is `first`. */
+/* Compares positions [3][NEIGHBOURS] with the faces of a cluster. The last bits of the least squared distances hold
+   which face it is, of those compared so far: `first` and the next ones. */
 static void compare(const float *restrict x, const float *restrict centre, size_t faces, int32_t first,
-                    float *restrict least, int32_t *restrict place) {
+                    int32_t *restrict least) {
     for (int j = 0; j < PATCH; j++) {
         const float cx = centre[j], cy = centre[faces + j], cz = centre[2 * faces + j];
 #pragma GCC unroll 1 /* else it is unrolled before it can become vectors */
         for (int i = 0; i < NEIGHBOURS; i++) {
             const float a = x[i] - cx, b = x[NEIGHBOURS + i] - cy, c = x[2 * NEIGHBOURS + i] - cz;
             const float apart = a * a + b * b + c * c;
-            place[i] = apart < least[i] ? first + j : place[i];
-            least[i] = apart < least[i] ? apart : least[i];
+            int32_t whole;
+            memcpy(&whole, &apart, sizeof whole);
+            whole = (whole & ~(TRIED * PATCH - 1)) | (first + j);
+            least[i] = whole < least[i] ? whole : least[i];
         }
     }
 }
@@ -740,13 +743,13 @@ static void find_nearest(const psi_model *m, psi_state *s) {
     bits -= 1; /* the last bits of a key hold its cluster, the others how near that may be */
     for (int32_t g = 0; g < f->clusters; g++) {
         const int32_t *vertex = f->cluster + g * NEIGHBOURS;
-        float x[3][NEIGHBOURS], mean[3] = {0}, least[NEIGHBOURS], span = 0.0f;
-        int32_t place[NEIGHBOURS] = {0}, last = -1;
+        float x[3][NEIGHBOURS], mean[3] = {0}, span = 0.0f;
+        int32_t least[NEIGHBOURS], chosen[TRIED] = {0}, last = -1;
         for (int c = 0; c < 3; c++)
             for (int i = 0; i < NEIGHBOURS; i++) mean[c] += (x[c][i] = s->held[c * wide + vertex[i]]) / NEIGHBOURS;
         for (int i = 0; i < NEIGHBOURS; i++) {
             const float a = x[0][i] - mean[0], b = x[1][i] - mean[1], c = x[2][i] - mean[2];
-            least[i] = FLT_MAX;
+            least[i] = INT32_MAX;
             span = a * a + b * b + c * c > span ? a * a + b * b + c * c : span;
         }
         span = sqrtf(span);
@@ -762,14 +765,20 @@ static void find_nearest(const psi_model *m, psi_state *s) {
             if (beyond > INT32_MAX) break;
             last += 1 + (int32_t)beyond;
             const int32_t whole = last & ~bits, p = last & bits;
-            float bound, farthest = 0.0f;
+            float bound, farthest;
+            int32_t largest = 0;
             memcpy(&bound, &whole, sizeof bound);
             bound -= most + span;
-            for (int i = 0; i < NEIGHBOURS; i++) farthest = least[i] > farthest ? least[i] : farthest;
-            if (bound > 0.0f && bound * bound > farthest) break; /* nothing nearer is left */
-            compare(x[0], s->centre + p * PATCH, faces, p * PATCH, least, place);
+            for (int i = 0; i < NEIGHBOURS; i++) largest = least[i] > largest ? least[i] : largest;
+            memcpy(&farthest, &largest, sizeof farthest);
+            if (k > 0 && bound > 0.0f && bound * bound > farthest) break; /* nothing nearer is left */
+            compare(x[0], s->centre + p * PATCH, faces, k * PATCH, least);
+            chosen[k] = p;
         }
-        for (int i = 0; i < NEIGHBOURS; i++) s->nearest[vertex[i]] = place[i];
+        for (int i = 0; i < NEIGHBOURS; i++) {
+            const int32_t place = least[i] & (TRIED * PATCH - 1);
+            s->nearest[vertex[i]] = chosen[place / PATCH] * PATCH + place % PATCH;
+        }
     }
 }
 
