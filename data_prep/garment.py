@@ -23,7 +23,7 @@ from data_prep.program import Axis, Unit, draw, run
 from data_prep.templates import build
 from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, bring
 
-OF_MESH = ("units", "up", "pin", "object", "shift", "turn", "sew", "allow", "loose", "flip", "cloth")  # options
+OF_MESH = ("units", "up", "pin", "object", "shift", "turn", "sew", "outer", "allow", "loose", "flip", "cloth")
 PIN_COLOUR = (0.85, 0.1, 0.1)
 
 
@@ -53,8 +53,10 @@ class Arguments:
     """Degrees by which the mesh is turned about the vertical before."""
     sew: float = 0.1
     """Millimetres between borders that are one seam."""
+    outer: bool = False
+    """Keep only what is outermost: the outer side of a mesh with thickness, a garment without its lining."""
     allow: bool = False
-    """Take a mesh that must be pushed far out of the body, or has open seams."""
+    """Take a mesh that must be pushed far out of the body, has open seams, or has layers close to each other."""
     loose: bool | None = None
     """Treat the mesh as hanging loosely, as skirts do; default: by its distance to the body."""
     flip: bool = False
@@ -90,6 +92,7 @@ def main(args: Arguments) -> None:
         objects=args.object,
         sew=args.sew,
         allow=args.allow,
+        outer=args.outer,
     )
     plain = Arguments(args.output)
     of_mesh = [name for name in OF_MESH if getattr(args, name) != getattr(plain, name)]

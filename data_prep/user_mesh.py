@@ -15,6 +15,7 @@ from clothjax.geometry.topology import boundary_loops, components
 from clothjax.types import Body, Garment
 from data_prep import marks, mesh_file
 from data_prep.dressing import WINDING, dress, limbs, push_out
+from data_prep.layers import THICKEST, inside, looks_away, outer_side, sides
 from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
 from data_prep.placement import Placement, Surface, better_place, check_objects, check_place, worn
@@ -41,7 +42,8 @@ class Answers(NamedTuple):
     cloth: tuple[str, ...] = ()  # WHAT=DENSITY,STRETCHING,BENDING with WHAT red or object:NAME
     objects: tuple[str, ...] = ()  # of the file, that are the garment; none for all
     sew: float = 0.1  # mm, between borders that are one seam
-    allow: bool = False  # take a mesh that is pushed far, or has open seams
+    allow: bool = False  # take a mesh that is pushed far, has open seams, or has layers close to each other
+    outer: bool = False  # leave out what lies inside: the inner side of one with thickness, linings
 
 
 class Working(NamedTuple):
@@ -79,6 +81,7 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     placed = answers.placement(mesh.vertices)
     check_objects(path, mesh, placed, surface)
     working, index = _clean(path, placed, mesh.faces)
+    working, index = _layers(path, working, index, surface, answers)
     working, index = _sew(path, working, index, answers)
     at_place = marks.is_place(answers.pin)
     if not at_place:
@@ -168,6 +171,45 @@ def _check_sides(path: str | Path, points: np.ndarray, faces: np.ndarray) -> Non
         )
 
 
+def _layers(
+    path: str | Path, working: Working, index: np.ndarray, surface: Surface, answers: Answers
+) -> tuple[Working, np.ndarray]:
+    """Leave out what lies inside, or refuse it if it is close; return the garment and where the file's vertices are."""
+    points, faces = working.vertices, working.faces
+    kept, ways = np.ones(len(faces), bool), "--outer keeps what is outermost"
+    two = sides(points, faces)
+    if two.thick.any():
+        place = np.round(points[faces[two.opposite >= 0][0]].mean(axis=0), 2)
+        said = f"it has thickness: its two sides are {1e3 * two.apart:.1f} mm apart, as at {place} m"
+        if answers.outer:
+            kept = outer_side(path, points, two, surface)
+            share = 100 * igl.doublearea(points, faces[kept]).sum() / igl.doublearea(points, faces).sum()
+            said = (
+                f"left out: {int((~kept).sum())} faces of an inner side {1e3 * two.apart:.1f} mm from the outer one, "
+                f"and of strips between them; {share:.0f} % of the area remains"
+            )
+        elif not answers.allow:
+            raise ValueError(f"{path}: {said}, but a cloth is one sheet: {ways}, --allow takes it as it is")
+        working = working.logged(said)
+    within, apart = inside(points, faces[kept], surface)
+    if within.any():
+        place = np.round(points[faces[kept][within][0]].mean(axis=0), 2)
+        said = f"a layer lies {1e3 * apart:.1f} mm inside another, as at {place} m"
+        if answers.outer:
+            kept[kept] = ~within
+            said = f"left out: {int(within.sum())} faces of layers {1e3 * apart:.1f} mm inside others"
+        elif apart < THICKEST and not answers.allow:
+            raise ValueError(f"{path}: {said}: a lining? {ways}, --allow takes all of its layers")
+        working = working.logged(said if answers.outer else f"{said}: {ways}")
+    if answers.outer and kept.all():
+        working = working.logged("it is a single layer: --outer leaves nothing out")
+    used = np.unique(faces[kept])
+    points, faces = compact(points, faces[kept])
+    place_of = np.full(len(working.vertices) + 1, -1)
+    place_of[used] = np.arange(len(used))
+    return working._replace(vertices=points, faces=faces, pinned=np.zeros(len(points), bool)), place_of[index]
+
+
 def _sew(path: str | Path, working: Working, index: np.ndarray, answers: Answers) -> tuple[Working, np.ndarray]:
     """Sew seams, and refuse one that stays open; return the garment, and the indices of the file's vertices in it."""
     vertices, faces, joined, splits = sewn(working.vertices, working.faces, 1e-3 * answers.sew)
@@ -191,11 +233,7 @@ def _orient(path: str | Path, working: Working, surface: Surface, flip: bool) ->
     if times.max() > 1:
         middle = np.round(points[half_edges[times.argmax()]].mean(axis=0), 3)
         raise ValueError(f"{path}: has only one side (a Moebius strip): cut it open, as along the edge at {middle} m")
-    nearest = igl.signed_distance(points, *surface, sign_type=WINDING)[2]
-    corners = points[turned]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outward = np.bincount(part, ((points - nearest)[turned].mean(axis=1) * normal).sum(axis=1))
-    reverse = (outward < 0) != flip
+    reverse = looks_away(points, turned, part, surface) == flip
     turned = np.where(reverse[part][:, None], turned[:, ::-1], turned)
     changed = int((_winding(turned) != _winding(faces)).sum())
     working = working._replace(faces=turned)

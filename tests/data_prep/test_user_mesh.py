@@ -242,6 +242,7 @@ def test_what_does_not_go_together_is_refused(tmp_path):
         ({"template": "skirt", "mesh": mesh}, "either --template or --mesh"),
         ({"template": "skirt", "pin": "red"}, "--pin is an option of --mesh"),
         ({"template": "skirt", "loose": False}, "--loose is an option of --mesh"),
+        ({"template": "skirt", "outer": True}, "--outer is an option of --mesh"),
         ({"template": "skirt", "vertices": 0}, "--vertices 0: 100 to 20000"),
     ):
         with pytest.raises(ValueError, match=said):
