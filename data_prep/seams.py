@@ -10,7 +10,7 @@ from clothjax.geometry.topology import boundary_mask, components
 from data_prep.mesh import edge_table
 
 WELD_DISTANCE = 1e-4  # m; closer vertices become one
-BESIDE = 0.002  # m, between the sides of a seam that is not sewn
+BESIDE, MAYBE_BESIDE = 0.002, 0.005  # m, between the sides of a seam that is not sewn; of one that may be meant
 LEAST_BESIDE = 0.05  # m, for which they must run so
 NEIGHBOUR = 0.02  # m along a border, within which it is beside itself at any rate
 SPACING = 2.5e-4  # m, between the points of a border that are compared
@@ -67,32 +67,72 @@ def _split_at_borders(vertices: np.ndarray, faces: np.ndarray, distance: float) 
         faces, splits = np.array(kept + halves), splits + len(halves) // 2
 
 
-def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def seams(
+    torn: tuple[np.ndarray, np.ndarray], vertices: np.ndarray, faces: np.ndarray, distance: float
+) -> tuple[int, int]:
+    """Count the pieces of a mesh and its seams: lines from junction to junction along which borders are joined.
+
+    Args:
+        torn: vertices [U, 3] m and faces of the mesh before it was welded and sewn.
+        vertices: [V, 3] m, after.
+        faces: [F, 3], after.
+        distance: in m, within which it was sewn.
+    """
+    edges, _, times = edge_table(torn[1])
+    borders, pieces = edges[times == 1], len(np.unique(components(len(torn[0]), torn[1])[torn[1]]))
+    if not len(borders):
+        return pieces, 0
+    edges, _, times = edge_table(faces)
+    edges = edges[times == 2]
+    a, b = vertices[edges].swapaxes(0, 1)
+    off = [igl.point_mesh_squared_distance(points, torn[0], borders)[0] for points in (a, (a + b) / 2, b)]
+    edges = edges[np.max(off, axis=0) <= max(distance, WELD_DISTANCE) ** 2]
+    order = np.argsort(edges.reshape(-1), kind="stable")
+    _, first, meeting = np.unique(edges.reshape(-1)[order], return_index=True, return_counts=True)
+    onward = first[meeting == 2]  # vertices at which a seam goes on
+    return pieces, len(np.unique(components(len(edges), np.stack([order[onward], order[onward + 1]], axis=1) // 2)))
+
+
+def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, distance: float, allow: bool) -> list[str]:
     """Refuse a mesh whose borders run closely beside each other, or a border beside itself, as an open seam does.
+
+    Args:
+        path: of the mesh.
+        vertices: [V, 3] m.
+        faces: [F, 3].
+        distance: in m, within which it was sewn.
+        allow: take it as it is.
+
+    Returns:
+        What is so taken, or runs farther apart than seams do: at most one line.
 
     Raises:
         ValueError: naming the file, the place, and the distance that sews it.
     """
     loops = [_dense(vertices[loop]) for loop in igl.boundary_loop_all(igl.bfs_orient(faces)[0])]
     if not loops:
-        return
+        return []
     points, along = (np.concatenate(parts) for parts in zip(*loops, strict=True))
     number = np.concatenate([np.full(len(own), k) for k, (_, own) in enumerate(loops)])
-    pairs = cKDTree(points).query_pairs(BESIDE, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(MAYBE_BESIDE, output_type="ndarray")
     a, b = pairs.T
-    pairs = pairs[(number[a] != number[b]) | (np.abs(along[a] - along[b]) > NEIGHBOUR)]
+    whole = np.array([own[-1] for _, own in loops])[number[a]]
+    onward = np.abs(along[a] - along[b])
+    pairs = pairs[(number[a] != number[b]) | (np.minimum(onward, whole - onward) > NEIGHBOUR)]
     apart = np.full(len(points), np.inf)
-    distance = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    between = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     for side in pairs.T:
-        np.minimum.at(apart, side, distance)
-    for k in range(len(loops)):
-        beside = (number == k) & np.isfinite(apart)
+        np.minimum.at(apart, side, between)
+    for reach, k in ((reach, k) for reach in (BESIDE, MAYBE_BESIDE) for k in range(len(loops))):
+        beside = (number == k) & (apart < reach)
         if SPACING * beside.sum() > LEAST_BESIDE:
-            place, wide = np.round(points[beside][0], 2), 1e3 * np.quantile(apart[beside], 0.9)
-            raise ValueError(
-                f"{path}: two borders run {1e3 * np.median(apart[beside]):.1f} mm beside each other, as at {place} m: "
-                f"a seam that is not sewn? --sew {np.ceil(wide):.0f} sews it, --allow leaves it open"
-            )
+            place, wide = np.round(points[beside][0], 2), max(np.quantile(apart[beside], 0.9), 1.01 * distance)
+            sews = f"--sew {np.ceil(1e3 * wide):.0f} sews"
+            said = f"two borders run {1e3 * np.median(apart[beside]):.1f} mm beside each other, as at {place} m"
+            if reach == MAYBE_BESIDE or allow:
+                return [f"{said}, and stay open; {sews} them"]
+            raise ValueError(f"{path}: {said}: a seam that is not sewn? {sews} it, --allow leaves it open")
+    return []
 
 
 def _dense(loop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,12 +20,13 @@ from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
 from data_prep.placement import Placement, Surface, better_place, check_objects, check_place, worn
 from data_prep.remesh import resample
-from data_prep.seams import WELD_DISTANCE, check_seams, sewn
+from data_prep.seams import WELD_DISTANCE, check_seams, seams, sewn
 
 FAR = 0.12  # m, from the body in the middle, above which it is asked whether a garment is worn there
 LOOSE_DISTANCE = 0.03  # m; a garment with a larger median distance to the body counts as loose
 DEEP, MAX_DEEP_SHARE = 0.03, 0.15  # m inside the body; a larger share of such vertices means another body
 MIN_VERTICES, MAX_VERTICES = 100, 20_000
+LEAST_PIECE = 10  # faces of a piece of cloth in the mean; smaller ones are faces that a file holds one by one
 DIFFUSION_SAMPLES = 500  # for each vertex of a loose garment
 FAR_PUSH, FARTHEST_PUSH = 0.01, 0.03  # m, by which a garment that is worn is pushed out of the body, and at most
 
@@ -83,6 +84,7 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     working, index = _clean(path, placed, mesh.faces)
     working, index = _layers(path, working, index, surface, answers)
     working, index = _sew(path, working, index, answers)
+    working = _log_seams(working, placed, mesh.faces[(index[mesh.faces] >= 0).all(axis=1)], answers.sew)
     at_place = marks.is_place(answers.pin)
     if not at_place:
         members = index[marks.marked(path, mesh, answers.pin, "--pin")]
@@ -216,13 +218,20 @@ def _sew(path: str | Path, working: Working, index: np.ndarray, answers: Answers
     count = len(working.vertices) - len(vertices)
     working = working._replace(vertices=vertices, faces=faces, pinned=np.zeros(len(vertices), bool))
     _check_sides(path, vertices, faces)
-    if not answers.allow:
-        check_seams(path, vertices, faces)
+    working = working.logged(*check_seams(path, vertices, faces, 1e-3 * answers.sew, answers.allow))
     if count:
         working = working.logged(f"sewn: {count} vertices of borders lay within {answers.sew:g} mm of others")
     if splits:
         working = working.logged(f"sewn: {splits} vertices lay on edges of another border")
     return working, np.where(index < 0, -1, joined[index])
+
+
+def _log_seams(working: Working, points: np.ndarray, torn: np.ndarray, sew: float) -> Working:
+    """Log how many pieces of the file, of vertices [V, 3] m and faces [F, 3], are joined along how many seams."""
+    pieces, count = seams((points, torn), working.vertices, working.faces, 1e-3 * sew)
+    if not count or len(torn) < LEAST_PIECE * pieces:
+        return working
+    return working.logged(f"sewn: {pieces} piece{'s' * (pieces > 1)} along {count} seam{'s' * (count > 1)}")
 
 
 def _orient(path: str | Path, working: Working, surface: Surface, flip: bool) -> Working:

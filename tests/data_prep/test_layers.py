@@ -5,12 +5,14 @@ import re
 import igl
 import numpy as np
 import pytest
+from samples import icosphere
 from scipy.spatial import cKDTree
 
 from clothjax.files import storage
-from clothjax.geometry.topology import boundary_loops, boundary_mask, edges
+from clothjax.geometry.topology import boundary_loops, boundary_mask, components, edges
 from data_prep import layers
 from data_prep.mesh import compact, edge_table, zero_set
+from data_prep.seams import seams
 from data_prep.user_mesh import Answers, bring
 
 OPENINGS = {"tshirt": 4, "skirt": 2}
@@ -235,17 +237,62 @@ def test_one_layer_is_not_taken_for_more(name, body, surface):
         assert not layers.sides(vertices, faces).thick.any() and not layers.inside(vertices, faces, surface)[0].any()
 
 
-def test_panels_that_face_each_other_are_no_layers(body, surface):
-    """The inner sides of two wide legs, each a panel of its own."""
-    vertices, faces = load("pants_1000", body)
-    x, y, _ = vertices[faces].mean(axis=1).T
-    middle = (y < np.quantile(y, 0.65)) & (y > np.quantile(y, 0.4))
-    wide = vertices + 0.05 * igl.per_vertex_normals(vertices, faces)
-    inward = igl.per_face_normals(vertices, faces, np.zeros(3))[:, 0] * np.sign(x) < -0.8
-    legs = [compact(wide, faces[middle & inward & (side * x > 0)]) for side in (1, -1)]
-    near = cKDTree(legs[0][0]).query(legs[1][0])[0]
-    assert min(len(leg[1]) for leg in legs) > 20 and np.quantile(near, 0.8) < layers.FARTHEST
-    assert not layers.inside(*joined(*legs), surface)[0].any()
+def test_panels_that_face_each_other_are_no_layers():
+    """The inner sides of two legs, each a panel of its own."""
+    ball, triangles = icosphere(radius=0.1)
+    legs = joined(*((ball + [x, 0, 0], triangles) for x in (-0.15, 0.15)))
+    square = np.array([[0, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
+    faces = np.array([[0, 1, 3], [0, 3, 2]])
+    facing, stacked = ([(square + [x, 0, 0], faces) for x in places] for places in ((-0.03, 0.03), (-0.03, -0.01)))
+    assert not layers.inside(*joined(*facing), legs)[0].any()
+    np.testing.assert_array_equal(layers.inside(*joined(*stacked), legs)[0], [True, True, False, False])
+
+
+@pytest.mark.parametrize("gap", [0.0, 5e-4])
+def test_panels_are_sewn_and_their_seams_told(gap, kind, sheet, body, names, save):
+    path = save(*halves(*sheet, gap))
+    if gap:
+        with pytest.raises(ValueError, match=r"mine\.obj: two borders run 0\.\d mm beside.*--sew 1 sews it"):
+            bring(path, body, names, TIGHT)
+    made, said = bring(path, body, names, TIGHT._replace(sew=0.6 if gap else 0.1))
+    assert "sewn: 2 pieces along 2 seams" in said and off(made, *sheet) < gap / 2 + 1e-5
+    assert len(boundary_loops(made.faces)) == OPENINGS[kind] and components(len(made.vertices), made.faces).max() == 0
+    np.testing.assert_allclose(lengths(made.vertices, made.faces), lengths(*sheet), atol=gap + 1e-5)
+
+
+@pytest.mark.parametrize("upper, expected", [(2, 4), (1, 3)])
+def test_seams_end_where_others_meet_them(upper, expected):
+    """Of two panels below and one or two above: a cross of four seams, or a T of three."""
+    panels, above = [], [(-1, 0, 1), (0, 0, 1)] if upper == 2 else [(-1, 0, 2)]
+    for left, low, wide in [(-1, -1, 1), (0, -1, 1), *above]:
+        x, y = np.meshgrid(np.arange(4 * wide + 1), np.arange(5))
+        corner = np.arange(x.size).reshape(x.shape)
+        a, b, c, d = (corner[i : i + 4, j : j + 4 * wide].reshape(-1) for i in (0, 1) for j in (0, 1))
+        points = np.stack([left + x.reshape(-1) / 4, low + y.reshape(-1) / 4, np.zeros(x.size)], axis=1)
+        panels.append((points, np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])))
+    torn = joined(*panels)
+    _, first, welded = np.unique(np.round(torn[0], 6), axis=0, return_index=True, return_inverse=True)
+    assert seams(torn, torn[0][first], welded.reshape(-1)[torn[1]], 1e-4) == (len(panels), expected)
+
+
+def test_a_seam_is_sewn_where_one_side_has_twice_as_many_vertices(kind, sheet, body, names, save):
+    left, right = halves(*sheet)
+    fine = igl.upsample(*left)
+    made, said = bring(save(fine, right), body, names, TIGHT)
+    assert "sewn: 2 pieces along 2 seams" in said and off(made, *sheet) < 1e-5
+    assert len(boundary_loops(made.faces)) == OPENINGS[kind] and components(len(made.vertices), made.faces).max() == 0
+    assert farthest(fine[0], made.vertices) < 1e-5 and area(made.vertices, made.faces) == pytest.approx(area(*sheet))
+    along = cKDTree(fine[0]).query(right[0])[0] < 1e-6  # the seam's ends and inner vertices, as of the coarse side
+    assert len(made.vertices) == len(fine[0]) + len(right[0]) - along.sum()
+
+
+def test_a_front_whose_edges_overlap_stays_open(kind, sheet, body, names, save):
+    left, right = halves(*sheet, -0.03, front=True)
+    over = (left[0][:, 0] < 0) & (left[0][:, 2] > 0.01)  # the left edge, laid on the right one
+    left[0][over, 2] += 0.01
+    made, said = bring(save(left, right), body, names, TIGHT)
+    assert "sewn: 2 pieces along 1 seam" in said and len(boundary_loops(made.faces)) == OPENINGS[kind] - 1
+    assert farthest(joined(left, right)[0], made.vertices) < 1e-5
 
 
 @pytest.mark.parametrize("thick", [False, True])

@@ -293,6 +293,19 @@ def test_a_seam_that_is_open_is_refused_or_sewn(skirt, body, names, save):
     assert any("2 parts, 2 openings" in line for line in said)
 
 
+@pytest.mark.parametrize("gap", [3e-3, 4.5e-3])
+def test_borders_farther_apart_than_a_seam_are_told(gap, skirt, body, names, save):
+    path = save(*seamed(skirt, gap=gap))
+    made, said = bring(path, body, names, Answers(loose=False))
+    (line,) = [line for line in said if "beside each other" in line]
+    assert f"{1e3 * gap:.1f} mm" in line and "stay open" in line and f"--sew {int(1e3 * gap) + 1} sews" in line
+    assert any("2 parts, 2 openings" in line for line in said)
+    place = np.array(re.search(r"as at \[(.*)\] m", line)[1].split(), float)
+    border = made.vertices[boundary_mask(made.faces, len(made.vertices))]
+    seam = border[np.abs(border[:, 2]) < 0.6 * gap]  # its two sides are at the middle of left and right
+    assert nearest(place[None], seam)[0] < 0.02
+
+
 def test_a_seam_of_one_border_with_itself_is_noticed(skirt, body, names, save):
     """A tube that is cut once has one border: down one side of the seam and up the other."""
     path = save(*seamed(skirt, gap=5e-4, both=False))
@@ -306,6 +319,7 @@ def test_a_seam_of_one_border_with_itself_is_noticed(skirt, body, names, save):
 def test_sides_of_a_seam_may_have_very_different_vertices(fronts, backs, gap, skirt, body, names, save):
     made, said = bring(save(*seamed(skirt, fronts, backs, gap)), body, names, Answers(pin="highest", sew=1.0))
     assert any("1 part, 2 openings" in line for line in said) and made.pinned.sum() == 32
+    assert "sewn: 2 pieces along 2 seams" in said
 
 
 def test_what_is_marked_is_pinned_after_a_seam_is_sewn(skirt, body, names, save):
