@@ -211,7 +211,7 @@ class ShapesConfig:
     Laplacian."""
     frames: int = 60
     descent_steps: int = 30
-    """Conjugate-gradient steps of a frame."""
+    """Steps of L-BFGS in a frame."""
     seed: int = 0
 
     RETIRED: ClassVar[dict[str, Any]] = {"farthest": 0.4}
