@@ -17,9 +17,10 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
-#define NEIGHBOURS 8      /* vertices of a cluster; of the body's faces ... */
-#define PATCH 16          /* ... a cluster has as many, and ... */
-#define TRIED 16          /* ... as many clusters are searched for what is nearest */
+#define NEIGHBOURS 8      /* vertices of a cluster */
+#define PATCH 16          /* faces of the body in one */
+#define TRIED 24          /* clusters of faces that are searched for a cluster of vertices */
+#define PLACES 512        /* a power of two, not less than the faces in those */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
@@ -726,7 +727,7 @@ static void compare(const float *restrict x, const float *restrict centre, size_
             const float apart = a * a + b * b + c * c;
             int32_t whole;
             memcpy(&whole, &apart, sizeof whole);
-            whole = (whole & ~(TRIED * PATCH - 1)) | (first + j);
+            whole = (whole & ~(PLACES - 1)) | (first + j);
             least[i] = whole < least[i] ? whole : least[i];
         }
     }
@@ -776,7 +777,7 @@ static void find_nearest(const psi_model *m, psi_state *s) {
             chosen[k] = p;
         }
         for (int i = 0; i < NEIGHBOURS; i++) {
-            const int32_t place = least[i] & (TRIED * PATCH - 1);
+            const int32_t place = least[i] & (PLACES - 1);
             s->nearest[vertex[i]] = chosen[place / PATCH] * PATCH + place % PATCH;
         }
     }

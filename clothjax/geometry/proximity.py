@@ -19,7 +19,7 @@ STRIDES = 2  # steps of a search along a surface
 LAST = jnp.iinfo(jnp.int32).max
 ASKED, GIVEN = 8, 16  # most positions, and points, of a cluster of `Clusters`
 BESIDE = 40  # points that lie beside a cluster of positions, if they are as densely everywhere; fewer positions else
-TRIED = 16  # clusters of points that are searched for a cluster of positions
+TRIED = 24  # clusters of points that are searched for a cluster of positions
 TILE = 256  # triangles tried together, where all are
 
 

@@ -39,7 +39,7 @@ def test_few_clusters_are_all_searched():
     random = np.random.default_rng(0)
     points, positions = (random.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (250, 77))
     clusters = proximity.clusters(random.uniform(size=(77, 3)), random.uniform(size=(250, 3)))
-    assert len(clusters.points) == proximity.TRIED
+    assert len(clusters.points) <= proximity.TRIED
     found = jax.jit(proximity.nearest_in_clusters)(positions, points, clusters)
     np.testing.assert_array_equal(found, brute_force(positions, points).argmin(axis=1))
 
