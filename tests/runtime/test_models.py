@@ -15,7 +15,7 @@ from clothjax.runtime import trained
 from clothjax.types import Motion, Pose
 
 
-def test_four_garments_come_with_the_library():
+def test_these_garments_come_with_the_library():
     assert trained.shipped() == ("dress", "pants", "skirt", "tshirt", "tshirt_pose")
 
 
