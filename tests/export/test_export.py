@@ -409,6 +409,17 @@ def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
         assert about["arguments"]["external"] == [3] and len(about["results"]) == 11
 
 
+def test_safetensors_of_forces_of_format_2_are_refused(forced, tmp_path):
+    """What the body's contact was found from is not in them."""
+    path = safetensors.to_safetensors(forced["skip"], tmp_path / "new.safetensors")
+    with safetensors._library().safe_open(str(path), framework="numpy") as file:
+        arrays = {name: file.get_tensor(name) for name in sorted(file.keys()) if ".clusters." not in name}
+        about = file.metadata() | {"format": "2"}
+    save_file(arrays, str(tmp_path / "old.safetensors"), metadata=about)
+    with pytest.raises(ValueError, match=r"old\.safetensors: .* \(format 2\); export it again"):
+        safetensors.from_safetensors(tmp_path / "old.safetensors")
+
+
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(convert, "FRAMES", 40)
     out = tmp_path / "s.onnx"
