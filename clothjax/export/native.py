@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import sidecar
-from clothjax.geometry import proximity
+from clothjax.geometry.clusters import ASKED
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
@@ -114,7 +114,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     order = np.argsort(np.asarray(predictor.body).argmax(axis=0), kind="stable")
     faces = np.argsort(order)[np.asarray(predictor.faces)][np.asarray(predictor.clusters.points).reshape(-1)]
     near = np.asarray(predictor.clusters.positions, np.int32)
-    near = np.pad(near, ((0, 0), (0, proximity.ASKED - near.shape[1])), mode="edge")
+    near = np.pad(near, ((0, 0), (0, ASKED - near.shape[1])), mode="edge")
     yield np.array(
         [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
          predictor.felt is not None, len(edges)],

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export.onnx_graph import Graph
-from clothjax.geometry.proximity import TRIED, Clusters
+from clothjax.geometry.clusters import TRIED, Clusters
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
@@ -263,7 +263,7 @@ def _planes(g: Graph, it: Parts, edges: np.ndarray, held: str, transforms: str, 
 
 
 def _nearest(g: Graph, clusters: Clusters, held: str, centres: str) -> str:
-    """Places [N, V] of the nearest of the points [N, 3, 16 P], as of `proximity.nearest_in_clusters`.
+    """Places [N, V] of the nearest of the points [N, 3, 16 P], as of `clusters.nearest_in_clusters`.
 
     Args:
         centres: the points in the order of their clusters.

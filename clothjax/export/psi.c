@@ -733,7 +733,7 @@ static void compare(const float *restrict x, const float *restrict centre, size_
     }
 }
 
-/* Finds the faces whose centres are nearest to the vertices of the held garment, as proximity.nearest_in_clusters. */
+/* Finds the faces whose centres are nearest to the vertices of the held garment, as clusters.nearest_in_clusters. */
 static void find_nearest(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
     const int32_t wide = padded(f->vertices), faces = padded(f->faces), patches = f->faces / PATCH;
@@ -750,7 +750,7 @@ static void find_nearest(const psi_model *m, psi_state *s) {
             for (int i = 0; i < NEIGHBOURS; i++) mean[c] += (x[c][i] = s->held[c * wide + vertex[i]]) / NEIGHBOURS;
         for (int i = 0; i < NEIGHBOURS; i++) {
             const float a = x[0][i] - mean[0], b = x[1][i] - mean[1], c = x[2][i] - mean[2];
-            least[i] = INT32_MAX;
+            least[i] = INT32_MAX & ~(PLACES - 1); /* the first face, where nothing is finite */
             span = a * a + b * b + c * c > span ? a * a + b * b + c * c : span;
         }
         span = sqrtf(span);

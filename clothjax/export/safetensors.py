@@ -11,7 +11,7 @@ import numpy as np
 from clothjax.config import Config
 from clothjax.files import configuration, damage
 from clothjax.files.checkpoint import nested
-from clothjax.geometry.proximity import Clusters
+from clothjax.geometry.clusters import Clusters
 from clothjax.networks.normalisation import ForceScales, Whitening
 from clothjax.runtime.models import (
     Bounds,

@@ -17,9 +17,6 @@ PASSES = 4  # rounds over all positions, before only those without an answer are
 CHUNK = 32  # positions searched together after that
 STRIDES = 2  # steps of a search along a surface
 LAST = jnp.iinfo(jnp.int32).max
-ASKED, GIVEN = 8, 16  # most positions, and points, of a cluster of `Clusters`
-BESIDE = 40  # points that lie beside a cluster of positions, if they are as densely everywhere; fewer positions else
-TRIED = 24  # clusters of points that are searched for a cluster of positions
 TILE = 256  # triangles tried together, where all are
 
 
@@ -54,22 +51,22 @@ def patches(vertices: np.ndarray, faces: np.ndarray) -> Patches:
     border[np.concatenate([start[open_edge], end[open_edge]])] = True
     centroids = np.asarray(vertices)[faces].mean(axis=1)
     # patches are halved in the same way, so that each PART of a patch holds neighbours too
-    parts = [np.concatenate(_halved(centroids, x, PART)) for x in _halved(centroids, np.arange(len(faces)), PATCH)]
+    parts = [np.concatenate(halved(centroids, x, PART)) for x in halved(centroids, np.arange(len(faces)), PATCH)]
     across = np.reshape(across, (-1, 3)).astype(np.int32)
-    return Patches(faces.astype(np.int32), across, border, _even(parts, PATCH), _around(faces, len(vertices)))
+    return Patches(faces.astype(np.int32), across, border, even(parts, PATCH), _around(faces, len(vertices)))
 
 
-def _halved(points: np.ndarray, members: np.ndarray, size: int) -> list[np.ndarray]:
+def halved(points: np.ndarray, members: np.ndarray, size: int) -> list[np.ndarray]:
     """Divide some of the points [N, 3] into groups of `size` neighbours; the last group may have fewer."""
     if len(members) <= size:
         return [members]
     axis = np.ptp(points[members], axis=0).argmax()
     ordered = members[np.argsort(points[members, axis], kind="stable")]
     half = size * -(-len(members) // (2 * size))
-    return _halved(points, ordered[:half], size) + _halved(points, ordered[half:], size)
+    return halved(points, ordered[:half], size) + halved(points, ordered[half:], size)
 
 
-def _even(groups: list[np.ndarray], size: int) -> np.ndarray:
+def even(groups: list[np.ndarray], size: int) -> np.ndarray:
     """Return groups as rows [G, size] int32; a shorter one repeats its last."""
     return np.stack([np.pad(group, (0, size - len(group)), mode="edge") for group in groups]).astype(np.int32)
 
@@ -154,58 +151,6 @@ def nearest_point(positions: Array, points: Array) -> Array:
     block = jnp.argmin(lowest, axis=1)
     place = jnp.argmin(score(half[block], local[block], positions[:, None]), axis=1)
     return (block * BLOCK + place).astype(jnp.int32)
-
-
-class Clusters(NamedTuple):
-    """Positions and points in clusters of neighbours, for `nearest_in_clusters`; a cluster repeats its last."""
-
-    positions: Array  # [G, S] int32, every position; S is at most `ASKED`
-    points: Array  # [P, GIVEN] int32, every point
-
-
-def clusters(positions: Array, points: Array) -> Clusters:
-    """Divide positions [V, 3] m and points [N, 3] m, as they lie in the canonical pose, into clusters of neighbours."""
-    size = max(1, min(ASKED, BESIDE * len(positions) // len(points)))
-    both = ((np.asarray(positions), size), (np.asarray(points), GIVEN))
-    return Clusters(*(_even(_halved(x, np.arange(len(x)), size), size) for x, size in both))
-
-
-def nearest_in_clusters(positions: Array, points: Array, clusters: Clusters) -> Array:
-    """Find the index [V] of the point [N, 3] m nearest to each position [V, 3] m, in the clusters that seem near.
-
-    For each cluster of positions, the `TRIED` clusters of points are searched that come nearest to its mean: by their
-    own mean, less the radius about it. No gradient.
-    """
-    positions, points, clusters = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, points, clusters)))
-    asked = [positions[:, i][clusters.positions].T for i in range(3)]  # [S, G]
-    given = [points[:, i][clusters.points] for i in range(3)]  # [P, GIVEN]
-    means = [jnp.mean(x, axis=1) for x in given]
-    radius = jnp.sqrt(jnp.max(sum((given[i] - means[i][:, None]) ** 2 for i in range(3)), axis=1))
-    apart = sum((jnp.mean(asked[i], axis=0)[None] - means[i][:, None]) ** 2 for i in range(3))
-    bound = jnp.sqrt(apart) + (jnp.max(radius) - radius)[:, None]  # [P, G], not below zero
-    # as in `nearest_face`: the last bits of a bound hold its cluster
-    last_cluster, size = len(clusters.points) - 1, clusters.points.shape[1]
-    bits = (1 << last_cluster.bit_length()) - 1
-    keys = jax.lax.bitcast_convert_type(bound.astype(jnp.float32), jnp.int32) & ~bits
-    keys |= jnp.arange(last_cluster + 1, dtype=jnp.int32)[:, None]
-    table = jnp.stack(given, axis=1).reshape(last_cluster + 1, -1)
-
-    def search(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
-        last, least, place = carry
-        last = jnp.min(jnp.where(keys > last[None], keys, LAST), axis=0)
-        cluster = last & bits
-        near = table[cluster].T.reshape(3, size, -1)
-        for number in range(size):  # an argmin would take several times as long
-            apart = sum((asked[i] - near[i, number][None]) ** 2 for i in range(3))
-            place = jnp.where(apart < least, (cluster * size + number)[None], place)
-            least = jnp.minimum(least, apart)
-        return (last, least, place), None
-
-    first = jnp.full(asked[0].shape[1], -1, jnp.int32)
-    start = (first, jnp.full_like(asked[0], jnp.inf), jnp.zeros(asked[0].shape, jnp.int32))
-    (_, _, place), _ = jax.lax.scan(search, start, length=min(TRIED, last_cluster + 1))
-    index = clusters.points.reshape(-1)[place.T]
-    return jnp.zeros(len(positions), jnp.int32).at[clusters.positions].set(index)
 
 
 def closest_on_triangle(positions: Array, corners: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.config import PhysicsConfig
-from clothjax.geometry.proximity import Clusters, nearest_in_clusters
+from clothjax.geometry.clusters import Clusters, nearest_in_clusters
 from clothjax.networks.normalisation import Whitening
 from clothjax.physics import incremental_potential
 from clothjax.physics.incremental_potential import TimeStep

@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, Int
 
+from clothjax.geometry.clusters import Clusters, divided
 from clothjax.geometry.proximity import (
     Patches,
     closest_on_triangle,
@@ -13,7 +15,7 @@ from clothjax.geometry.proximity import (
     winding_number,
 )
 from clothjax.geometry.vectors import unit
-from clothjax.types import Array, Contact, EdgeContact, Mesh, SelfContact
+from clothjax.types import Array, Body, Contact, EdgeContact, Garment, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
 DEEP = 0.7  # of a triangle's size, the root of its area: deeper than this the winding number must agree
@@ -158,6 +160,11 @@ def find_at_centroids(
     (point, normal), (point_next, normal_next) = centroids(body, faces), centroids(body_next, faces)
     face = nearest_point(positions, point)
     return Contact(point[face], point_next[face], normal[face], normal_next[face], nearest_point(positions, body))
+
+
+def clusters(garment: Garment, body: Body) -> Clusters:
+    """Divide a garment's vertices and the centroids of a body's faces into clusters, on the host."""
+    return divided(garment.vertices, np.asarray(body.vertices)[np.asarray(body.faces)].mean(axis=1))
 
 
 def centroids(

@@ -12,11 +12,11 @@ import numpy as np
 from clothjax.body import reach, skinning
 from clothjax.config import Config
 from clothjax.files import storage
-from clothjax.geometry import proximity, topology
-from clothjax.geometry.proximity import Clusters
+from clothjax.geometry import topology
+from clothjax.geometry.clusters import Clusters
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
-from clothjax.physics import energies
+from clothjax.physics import contact_search, energies
 from clothjax.runtime import trained
 from clothjax.runtime.models import (
     Bounds,
@@ -70,8 +70,7 @@ def build(
     touched = mesh = clusters = None
     if isinstance(normalizers, ForceScales):
         touched = reach.reachable(body, garment, config.physics.reach)
-        centroids = np.asarray(touched.vertices)[np.asarray(touched.faces)].mean(axis=1)
-        clusters = proximity.clusters(garment.vertices, centroids)
+        clusters = contact_search.clusters(garment, touched)
         mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     network, wearer = _arrays(
         garment, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas, material, config

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from clothjax.config import Config
-from clothjax.geometry.proximity import Clusters
+from clothjax.geometry.clusters import Clusters
 from clothjax.networks.normalisation import ForceScales
 from clothjax.types import Array, Material, Mesh, Rest
 

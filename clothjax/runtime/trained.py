@@ -168,10 +168,10 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         predictor: parameters of the latent predictor.
         normalizers: scales of its codes and inputs.
     """
-    exact, scales = set(), normalizers._asdict()
+    exact, scales = None, normalizers._asdict()
     if isinstance(normalizers, ForceScales):
         del scales["whitening"]  # of the inverse Hessian, which must then be exact
-        exact.add(HESSIAN)
+        exact = HESSIAN
     else:
         scales = {name: each._asdict() for name, each in scales.items()}
     parts = {
@@ -183,7 +183,7 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
     arrays: dict[str, Any] = {"format": np.int32(FORMAT)}
     for name, leaf in checkpoint.named(parts).items():
         leaf = np.asarray(leaf)
-        if name in exact:
+        if name == exact:
             pass
         elif name in HALVED:
             leaf = leaf.astype(np.float16)

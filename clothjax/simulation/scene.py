@@ -8,7 +8,9 @@ import numpy as np
 from clothjax.body import reach
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
-from clothjax.geometry.proximity import Clusters, Patches, clusters, patches
+from clothjax.geometry.clusters import Clusters
+from clothjax.geometry.proximity import Patches, patches
+from clothjax.physics import contact_search
 from clothjax.types import Array, Body, Garment, Mesh
 
 
@@ -66,7 +68,6 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
     )
     touchable = config.physics.body != "none"
     within = reach.reachable(body, garment, config.physics.reach) if touchable else _bare(body)
-    surface, body_faces = np.asarray(within.vertices), np.asarray(within.faces)
     return Scene(
         garment=garment,
         body=within,
@@ -75,8 +76,8 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
         graph=graph,
         level=mesh_hierarchy.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
-        patches=patches(surface, body_faces) if touchable else None,
-        clusters=clusters(garment.vertices, surface[body_faces].mean(axis=1)) if touchable else None,
+        patches=patches(np.asarray(within.vertices), np.asarray(within.faces)) if touchable else None,
+        clusters=contact_search.clusters(garment, within) if touchable else None,
         garment_patches=patches(np.asarray(garment.vertices), faces),
     )
 

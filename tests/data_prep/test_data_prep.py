@@ -42,16 +42,6 @@ SHARED = Path(__file__).parents[3] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="needs the recordings in ../shared/data")
 
 
-@pytest.fixture(scope="module")
-def body():
-    return storage.load_body("body")
-
-
-@pytest.fixture(scope="module")
-def names():
-    return storage.joint_names("body")
-
-
 # Command lines
 
 

@@ -12,21 +12,11 @@ from clothjax.files import storage
 from clothjax.geometry.topology import boundary_loops, boundary_mask, components, edges
 from data_prep import layers
 from data_prep.mesh import compact, edge_table, zero_set
-from data_prep.seams import seams
+from data_prep.seams import check_seams, seams
 from data_prep.user_mesh import Answers, bring
 
 OPENINGS = {"tshirt": 4, "skirt": 2}
 TIGHT = Answers(loose=False)  # its skinning takes no samples, which is faster
-
-
-@pytest.fixture(scope="module")
-def body():
-    return storage.load_body("body")
-
-
-@pytest.fixture(scope="module")
-def names():
-    return storage.joint_names("body")
 
 
 @pytest.fixture(scope="module")
@@ -258,6 +248,25 @@ def test_panels_are_sewn_and_their_seams_told(gap, kind, sheet, body, names, sav
     assert "sewn: 2 pieces along 2 seams" in said and off(made, *sheet) < gap / 2 + 1e-5
     assert len(boundary_loops(made.faces)) == OPENINGS[kind] and components(len(made.vertices), made.faces).max() == 0
     np.testing.assert_allclose(lengths(made.vertices, made.faces), lengths(*sheet), atol=gap + 1e-5)
+
+
+def test_the_place_of_an_open_seam_is_on_it():
+    """A slit of 1 mm, 20 cm into a square of 40 cm; the border is one line, which begins far from it."""
+    x, y = (0.02 * part.reshape(-1) for part in np.meshgrid(np.arange(21), np.arange(21)))
+    points = np.stack([x, y, 0 * x], axis=1)
+    corner = np.arange(441).reshape(21, 21)
+    a, b, c, d = (corner[i : i + 20, j : j + 20].reshape(-1) for i in (0, 1) for j in (0, 1))
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    lip = np.flatnonzero((y == 0.2) & (x > 0.2))
+    above = points[faces].mean(axis=1)[:, 1] > 0.2
+    upper = np.full(441, -1)
+    upper[lip] = 441 + np.arange(len(lip))
+    moved = above[:, None] & (upper[faces] >= 0)
+    points, faces = np.concatenate([points, points[lip] + [0, 0.001, 0]]), np.where(moved, upper[faces], faces)
+    with pytest.raises(ValueError, match=r"two borders run 1\.0 mm beside each other") as refused:
+        check_seams("mine.obj", points, faces, 1e-4, False)
+    place = np.array(re.search(r"as at \[(.*?)\] m", str(refused.value))[1].split(), float)
+    assert place[0] > 0.19 and place[1] == pytest.approx(0.2, abs=0.01)
 
 
 @pytest.mark.parametrize("upper, expected", [(2, 4), (1, 3)])

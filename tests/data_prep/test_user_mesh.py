@@ -16,16 +16,6 @@ from data_prep.user_mesh import Answers, bring
 
 
 @pytest.fixture(scope="module")
-def body():
-    return storage.load_body("body")
-
-
-@pytest.fixture(scope="module")
-def names():
-    return storage.joint_names("body")
-
-
-@pytest.fixture(scope="module")
 def skirt(body):
     """Vertices and faces of the embedded skirt."""
     made = storage.load_garment("skirt_1000", body)

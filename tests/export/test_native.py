@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shutil
 import subprocess
 
@@ -17,6 +18,7 @@ from clothjax.body import skinning
 from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
 from clothjax.files import storage
+from clothjax.geometry import clusters
 from clothjax.networks import forces
 from clothjax.runtime import drape, inference, models, specialise
 from clothjax.runtime.models import Layer, State
@@ -347,10 +349,10 @@ def test_c_inside_of_jax_refuses_what_is_not_its_own(packed, model, motion):
         psi_ffi.step(damaged, state, pose)[1].block_until_ready()
 
 
-def made(folder, *flags):
-    """The example program."""
+def made(folder, *flags, source=PLAY):
+    """The example program, or another one."""
     program = folder / "play"
-    sources = (PLAY, native.SOURCES[1])
+    sources = (source, native.SOURCES[1])
     command = [native.compiler(), *flags, f"-I{native.SOURCES[0].parent}", *sources, "-lm", "-o", program]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode and "-fsanitize=address,undefined" in flags:
@@ -408,6 +410,41 @@ def hurt(data, structure, rng):
         at = int(rng.choice(structure) if kind == 2 else rng.integers(len(data)))
         damaged[at] = rng.integers(256)
     return bytes(damaged)
+
+
+LOST = """
+#include "psi.h"
+#include <math.h>
+#include <stdlib.h>
+int main(int count, char **files) {
+    psi_model *m = psi_load(files[count - 1], NULL);
+    float *turns = calloc(9 * psi_joints(m), sizeof *turns), *kept = calloc(psi_carried(m), sizeof *kept);
+    float place[3] = {0}, *vertices = calloc(3 * psi_vertices(m), sizeof *vertices);
+    for (int i = 0; i < 9 * psi_joints(m); i += 9) turns[i] = turns[i + 4] = turns[i + 8] = 1.0f;
+    psi_state *s = psi_begin(m, turns, place);
+    psi_keep(m, s, kept);
+    for (int i = 0; i < psi_carried(m); i++) kept[i] = -NAN; /* as an invalid operation gives it */
+    psi_put_back(m, s, kept);
+    return psi_step(m, s, turns, place, vertices);
+}
+"""
+
+
+def test_a_state_of_nothing_finite_reads_nothing_beyond_its_arrays(tmp_path):
+    (tmp_path / "lost.c").write_text(LOST)
+    program = made(tmp_path, *SANITIZERS, source=tmp_path / "lost.c")
+    path = native.to_c(random_force_psi().model(), tmp_path / "g.psi")
+    environment = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
+    done = subprocess.run([program, path], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0 and not done.stderr, done.stderr
+
+
+def test_c_searches_as_many_clusters_of_the_same_size():
+    """They are constants there: loops of a known length become vectors."""
+    said = dict(re.findall(r"#define (NEIGHBOURS|PATCH|TRIED|PLACES) (\d+)", native.SOURCES[1].read_text()))
+    neighbours, patch, tried, places = (int(said[name]) for name in ("NEIGHBOURS", "PATCH", "TRIED", "PLACES"))
+    assert (neighbours, patch, tried) == (clusters.ASKED, clusters.GIVEN, clusters.TRIED)
+    assert places >= tried * patch and places & (places - 1) == 0
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(5000, marks=pytest.mark.slow)])

@@ -34,38 +34,6 @@ def test_nearest_is_that_of_brute_force(origin):
     np.testing.assert_allclose(chosen**2, distances.min(axis=1) ** 2, atol=5e-7)
 
 
-def test_few_clusters_are_all_searched():
-    """Whatever has become of the places by which they were divided."""
-    random = np.random.default_rng(0)
-    points, positions = (random.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (250, 77))
-    clusters = proximity.clusters(random.uniform(size=(77, 3)), random.uniform(size=(250, 3)))
-    assert len(clusters.points) <= proximity.TRIED
-    found = jax.jit(proximity.nearest_in_clusters)(positions, points, clusters)
-    np.testing.assert_array_equal(found, brute_force(positions, points).argmin(axis=1))
-
-
-@pytest.mark.parametrize("origin", [0.0, 30.0])
-def test_near_a_bent_body_the_clusters_searched_hold_what_is_nearest(origin):
-    """A tube around an arm of a ball's many faces, both bent together after they were divided."""
-    random = np.random.default_rng(0)
-    vertices, faces = icosphere(4)
-    limb = vertices[faces].mean(axis=1) * [0.5, 0.1, 0.1]
-    around = random.uniform(0, 2 * np.pi, 1003)
-    along, out = random.uniform(-0.4, 0.4, 1003), random.uniform(0.08, 0.13, 1003)
-    tube = np.stack([along, out * np.cos(around), out * np.sin(around)], axis=1)
-    clusters = proximity.clusters(tube, limb)
-    for axis, size in ((0, 1003), (1, len(limb))):
-        assert set(np.unique(clusters[axis])) == set(range(size))
-
-    def bent(points):
-        angle = 2.0 * np.maximum(points[:, 0], 0.0)
-        return (points + np.stack([0 * angle, points[:, 0] * angle, 0 * angle], axis=1) + origin).astype(np.float32)
-
-    distances = brute_force(bent(tube), bent(limb))
-    found = distances[np.arange(1003), proximity.nearest_in_clusters(bent(tube), bent(limb), clusters)]
-    assert np.mean(found > distances.min(axis=1) + 1e-5) < 0.005
-
-
 @pytest.mark.usefixtures("search")
 @pytest.mark.parametrize("rounds, near", [(4, 0.1), (3, 0.2), (2, 0.5)])
 def test_winding_numbers_are_those_of_libigl(rounds, near):

@@ -9,7 +9,7 @@ import pytest
 from samples import sheet, time_step
 
 from clothjax.config import PhysicsConfig
-from clothjax.geometry import proximity
+from clothjax.geometry import clusters
 from clothjax.networks import forces
 from clothjax.physics import energies, incremental_potential
 
@@ -60,7 +60,7 @@ def test_planes_over_a_round_body_are_raised_by_the_height_of_its_arcs(radius, l
     count = int(np.ceil(2 * np.pi * radius / length))
     corners = radius * normals[np.arange(count) * 4000 // count]
     edges = np.stack([np.arange(count), np.roll(np.arange(count), -1)], axis=1)
-    near = proximity.clusters(corners, radius * normals)
+    near = clusters.divided(corners, radius * normals)
     planes = forces.felt(jnp.asarray(corners), (radius * normals, normals), near, jnp.asarray(edges))
     middles = np.asarray(planes.point_next)[edges].mean(axis=1)
     apart = np.linalg.norm(middles, axis=1) - radius
@@ -72,7 +72,7 @@ def test_planes_of_a_hollow_and_of_a_flat_body_are_not_raised_and_none_by_more_t
     inside = np.array([[0.05, 0, 0], [0, 0.05, 0], [0.0, 0.1, 0.0]], np.float32)  # the third edge is along a wall
     faces = inside[:, None] + np.zeros((3, 1, 3), np.float32)
     normals = np.array([[-1, 0, 0], [0, -1, 0], [0, -1, 0]], np.float32)
-    near, edges = proximity.clusters(inside, faces[:, 0]), np.array([[0, 1], [1, 2]], np.int32)
+    near, edges = clusters.divided(inside, faces[:, 0]), np.array([[0, 1], [1, 2]], np.int32)
 
     def raised(normals, scale=1.0):
         at = jnp.asarray(scale * inside)

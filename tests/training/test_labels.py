@@ -12,7 +12,8 @@ from toy import assert_same, small
 from clothjax.body import motion_clips
 from clothjax.config import LabelsConfig, PhysicsConfig
 from clothjax.evaluation import report
-from clothjax.geometry.proximity import nearest_in_clusters, nearest_point
+from clothjax.geometry.clusters import nearest_in_clusters
+from clothjax.geometry.proximity import nearest_point
 from clothjax.material import material_inputs
 from clothjax.networks import animators, forces, phi
 from clothjax.physics import contact_search, descent, incremental_potential

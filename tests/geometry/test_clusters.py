@@ -1,0 +1,41 @@
+"""The nearest point among clusters, against brute force."""
+
+import jax
+import numpy as np
+import pytest
+from samples import icosphere
+from scipy.spatial.distance import cdist
+
+from clothjax.geometry import clusters
+
+
+def test_few_clusters_are_all_searched():
+    """Whatever has become of the places by which they were divided."""
+    random = np.random.default_rng(0)
+    points, positions = (random.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (250, 77))
+    divided = clusters.divided(random.uniform(size=(77, 3)), random.uniform(size=(250, 3)))
+    assert len(divided.points) <= clusters.TRIED
+    found = jax.jit(clusters.nearest_in_clusters)(positions, points, divided)
+    np.testing.assert_array_equal(found, cdist(positions, points).argmin(axis=1))
+
+
+@pytest.mark.parametrize("origin", [0.0, 30.0])
+def test_near_a_bent_body_the_clusters_searched_hold_what_is_nearest(origin):
+    """A tube around an arm of a ball's many faces, both bent together after they were divided."""
+    random = np.random.default_rng(0)
+    vertices, faces = icosphere(4)
+    limb = vertices[faces].mean(axis=1) * [0.5, 0.1, 0.1]
+    around = random.uniform(0, 2 * np.pi, 1003)
+    along, out = random.uniform(-0.4, 0.4, 1003), random.uniform(0.08, 0.13, 1003)
+    tube = np.stack([along, out * np.cos(around), out * np.sin(around)], axis=1)
+    divided = clusters.divided(tube, limb)
+    for axis, size in ((0, 1003), (1, len(limb))):
+        assert set(np.unique(divided[axis])) == set(range(size))
+
+    def bent(points):
+        angle = 2.0 * np.maximum(points[:, 0], 0.0)
+        return (points + np.stack([0 * angle, points[:, 0] * angle, 0 * angle], axis=1) + origin).astype(np.float32)
+
+    distances = cdist(bent(tube), bent(limb))
+    found = distances[np.arange(1003), clusters.nearest_in_clusters(bent(tube), bent(limb), divided)]
+    assert np.mean(found > distances.min(axis=1) + 1e-5) < 0.005
