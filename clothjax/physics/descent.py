@@ -51,7 +51,6 @@ def _direction(at: _Iterate, precondition: Precondition, bound: float) -> Array:
     scale = jnp.sum(at.moves[0] * turn) / jnp.maximum(jnp.sum(turn * precondition(turn)), 1e-20)
     scale = jnp.where(at.weights[0] > 0, jnp.clip(scale, *SCALE), 1.0)
     new, _ = jax.lax.scan(forward, scale * precondition(rest), (steps, along), reverse=True)
-    new = jnp.where(jnp.sum(new * at.gradient) > 0, new, precondition(at.gradient))
     # deep collisions push thousands of times harder than the rest
     return -new / jnp.sqrt(1.0 + jnp.sum(new * new) / bound**2)
 

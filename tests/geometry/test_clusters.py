@@ -39,3 +39,15 @@ def test_near_a_bent_body_the_clusters_searched_hold_what_is_nearest(origin):
     distances = cdist(bent(tube), bent(limb))
     found = distances[np.arange(1003), clusters.nearest_in_clusters(bent(tube), bent(limb), divided)]
     assert np.mean(found > distances.min(axis=1) + 1e-5) < 0.005
+
+
+def test_a_wide_cluster_is_as_near_as_its_border_may_be():
+    """One whose mean is the farthest, but which holds the nearest point."""
+    random = np.random.default_rng(0)
+    means = random.normal(size=(clusters.TRIED + 5, 1, 3))
+    means *= 0.5 / np.linalg.norm(means, axis=-1, keepdims=True)
+    tight = (means + 0.01 * random.normal(size=(len(means), clusters.GIVEN, 3))).reshape(-1, 3)
+    wide = np.stack([np.linspace(0.1, 1.2, clusters.GIVEN), *np.zeros((2, clusters.GIVEN))], axis=1)
+    points = np.concatenate([tight, wide]).astype(np.float32)
+    divided = clusters.Clusters(np.zeros((1, 1), np.int32), np.arange(len(points)).reshape(-1, clusters.GIVEN))
+    assert clusters.nearest_in_clusters(np.zeros((1, 3), np.float32), points, divided) == len(tight)

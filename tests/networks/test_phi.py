@@ -68,6 +68,31 @@ def test_steps_learn_the_curvature():
     assert left(8) < 0.1 and left(20) < 1e-6
 
 
+@pytest.mark.parametrize("known", [0, 1, 5])
+def test_the_direction_is_that_of_dense_bfgs(known):
+    """Against the update of the whole inverse Hessian, oldest step first, begun with the scaled preconditioner."""
+    random, size = np.random.default_rng(known), 8
+    mixed = random.normal(size=(2, size, size))
+    hessian, inverse = mixed @ mixed.transpose(0, 2, 1) + np.eye(size)
+    inverse = inverse / 60
+    moves, gradient = random.normal(size=(known, size)), random.normal(size=size)
+    turns = moves @ hessian
+    dense = inverse
+    if known:
+        dense = inverse * (moves[0] @ turns[0]) / (turns[0] @ inverse @ turns[0])
+        assert descent.SCALE[0] < dense[0, 0] / inverse[0, 0] < descent.SCALE[1]
+    for move, turn in zip(moves[::-1], turns[::-1], strict=True):
+        part = np.eye(size) - np.outer(move, turn) / (move @ turn)
+        dense = part @ dense @ part.T + np.outer(move, move) / (move @ turn)
+    empty = ((0, descent.MEMORY - known), (0, 0))
+    with jax.enable_x64(True):
+        at = descent._first(jnp.zeros(size), lambda _: (0.0, jnp.asarray(gradient)), lambda g: inverse @ g, 1e9)
+        weights = np.pad(1 / np.sum(moves * turns, axis=1), empty[0])
+        at = at._replace(moves=np.pad(moves, empty), turns=np.pad(turns, empty), weights=weights)
+        found = descent._direction(jax.tree.map(jnp.asarray, at), lambda g: inverse @ g, 1e9)
+    np.testing.assert_allclose(found, -dense @ gradient, rtol=1e-9)
+
+
 def test_no_step_overshoots_what_the_hessian_does_not_know(coded):
     """A floor a thousand times stiffer than the cloth: every step goes down, and many end at the minimum."""
     inverse, decode, potential = coded
