@@ -175,6 +175,9 @@ class ModelConfig:
     """Add a linear map of the code to the decoder's output, unlike the thesis. Narrow ReLU layers alone leave the
     blend-shape weights few directions to move in."""
     blendshapes: int = 384
+    relaxation: int = 0
+    """Jacobi steps down the stretching energy that end the decoder. They let blend shapes fold without stretching. Only
+    with `stage2.forces`."""
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
     remat: bool = False
@@ -190,6 +193,7 @@ class ModelConfig:
 
     def __post_init__(self):
         _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")
+        _require(0 <= self.relaxation <= 16, f"relaxation must be 0 to 16, got {self.relaxation}")
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
         _require(len(self.convolution) > 0, "the convolution needs a block")
         _require(
@@ -436,6 +440,10 @@ class Config:
         _require(
             not self.stage2.forces or self.model.latent_update == "descent",
             "stage2.forces needs the inverse Hessian of model.latent_update: descent",
+        )
+        _require(
+            self.stage2.forces or self.model.relaxation == 0,
+            "model.relaxation needs stage2.forces: a Psi without forces does not know the cloth",
         )
         _require(
             not self.stage2.forces or (self.physics.body == "moving" and not self.peer.network),

@@ -352,12 +352,14 @@ class ForcePsi(NamedTuple):
         )
 
 
-def random_force_psi(skip=True, limit=5.0, **physics):
+def random_force_psi(skip=True, limit=5.0, relaxation=0, **physics):
     """A random Psi with forces whose code decays, within +-`limit`, with either a skip or a ReLU on the weights."""
     config = small()
     config = dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, decoder=(24, 16), decoder_skip=skip, blendshape_relu=not skip),
+        model=dataclasses.replace(
+            config.model, decoder=(24, 16), decoder_skip=skip, blendshape_relu=not skip, relaxation=relaxation
+        ),
         stage2=dataclasses.replace(config.stage2, forces=True, hidden=(32, 24)),
         physics=dataclasses.replace(config.physics, **physics),
     )

@@ -27,7 +27,7 @@ from clothjax.types import Array, Motion
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; ...
-FORCED = 3  # ... and of one with forces
+FORCED = 4  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -117,7 +117,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     near = np.pad(near, ((0, 0), (0, ASKED - near.shape[1])), mode="edge")
     yield np.array(
         [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
-         predictor.felt is not None, len(edges)],
+         predictor.felt is not None, len(edges), 0 if cloth.mobility is None else model.config.model.relaxation],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
@@ -131,6 +131,8 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(np.asarray(rest.inverse).reshape(-1, 4).T)
     yield _padded(2.0 * np.asarray(cloth.material.mu) * size)
     yield _padded(np.asarray(cloth.material.lam) * size)
+    if cloth.mobility is not None:
+        yield _padded(cloth.mobility)
     yield _padded(mesh.hinges.T)
     yield _padded(stiffness / (4.0 * np.asarray(rest.hinge_area)))
     yield _padded(rest.hinge_angle)

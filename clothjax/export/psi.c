@@ -13,6 +13,7 @@
 #define MOST_JOINTS 1024
 #define MOST_WIDTH 65536  /* inputs of a layer: their sums have room in 32 bits */
 #define MOST_HIDDEN 16
+#define MOST_STEPS 16
 #define MOST_ELEMENTS (1 << 20)
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
@@ -27,6 +28,8 @@
 #define STILL 2.5e-5f     /* of rotation matrices, and in m: a pose that changes by less stands still */
 #define AWAKE 60          /* frames that the cloth moves freely for on a body that stands still; then ... */
 #define SLOWING 0.95f     /* ... in each frame the change of the code shrinks by this */
+#define LONGEST 0.005f    /* m, that a vertex moves in a step of relaxation at most */
+#define FLAT 1e-3f        /* least determinant of a transform that is inverted */
 
 typedef struct { /* y = bias + scale * (weights (gain * x)); without inputs the bias alone */
     int32_t inputs, outputs, stride;
@@ -43,12 +46,13 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 } exact;
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
-    int32_t vertices, triangles, hinges, body, faces, clusters, edges;
+    int32_t vertices, triangles, hinges, body, faces, clusters, edges, relaxation;
     float timestep, gravity;
     float stiffness, offset, highest, deepest;        /* of planes that are touched: in N/m; m; raised, pushed at most */
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
+    const float *mobility;                            /* [vertices] m/N, in a step of relaxation */
     const float *bend, *angle;                        /* [hinges] */
     const int32_t *face, *cluster, *edge;             /* [3][faces], by PATCH; [clusters][NEIGHBOURS]; [2][edges] */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
@@ -222,7 +226,7 @@ static exact read_exact(reader *r, psi_model *m) {
 
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
-    const int32_t *head = integers(r, 8);
+    const int32_t *head = integers(r, 9);
     const float *rates = floats(r, 6);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
@@ -234,6 +238,7 @@ static void read_forces(reader *r, psi_model *m) {
     if (f->faces % PATCH) r->sound = 0;
     m->apart = head[6];
     f->edges = within(r, head[7], 0, MOST_ELEMENTS);
+    f->relaxation = within(r, head[8], 0, MOST_STEPS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
     f->highest = rates[4], f->deepest = rates[5];
     f->mass = floats(r, padded(f->vertices));
@@ -241,6 +246,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->inverse = floats(r, 4 * (size_t)padded(f->triangles));
     f->mu = floats(r, padded(f->triangles));
     f->lam = floats(r, padded(f->triangles));
+    if (f->relaxation) f->mobility = floats(r, padded(f->vertices));
     f->hinge = indices(r, 4 * padded(f->hinges), f->vertices);
     f->bend = floats(r, padded(f->hinges));
     f->angle = floats(r, padded(f->hinges));
@@ -310,10 +316,10 @@ static psi_model *failed(psi_model *m, const char **error, const char *why) {
 }
 
 static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char **error) {
-    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 3 */
+    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 4 */
     int32_t version[2] = {0, 0};
     if (size >= ALIGN) memcpy(version, bytes, sizeof version);
-    if (version[0] != name || (version[1] != 1 && version[1] != 3)) return failed(m, error, "not a .psi of this version");
+    if (version[0] != name || (version[1] != 1 && version[1] != 4)) return failed(m, error, "not a .psi of this version");
     reader r = {bytes, size, 1};
     read_model(&r, m);
     if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
@@ -1067,6 +1073,39 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;
 }
 
+/* Relaxes the garment that is posed in s->held, and moves s->garment by as much: relaxation.relaxed, drape._hung. */
+static void relax(const forces *f, psi_state *s) {
+    const size_t wide = padded(f->vertices);
+    float *push = s->force, *before = s->force + 3 * wide;
+    memcpy(before, s->held, 3 * wide * sizeof(float));
+    for (int32_t n = 0; n < f->relaxation; n++) {
+        float *x = s->held, *y = x + wide, *z = y + wide;
+        memset(push, 0, 3 * wide * sizeof(float));
+        push_stretching(f, s->held, push);
+        for (size_t i = 0; i < wide; i++) {
+            const float a = f->mobility[i] * push[i], b = f->mobility[i] * push[wide + i],
+                        c = f->mobility[i] * push[2 * wide + i],
+                        share = 1.0f / sqrtf(1.0f + (a * a + b * b + c * c) / (LONGEST * LONGEST));
+            x[i] += share * a, y[i] += share * b, z[i] += share * c;
+        }
+    }
+    for (size_t i = 0; i < wide; i++) {
+        float column[3][3], moved[3], back[3], size = 0.0f; /* Cramer's rule, as skinning.unapply_direction */
+        for (int c = 0; c < 3; c++) {
+            moved[c] = s->held[c * wide + i] - before[c * wide + i];
+            for (int k = 0; k < 3; k++) column[k][c] = s->blended[(4 * c + k) * wide + i];
+        }
+        for (int k = 0; k < 3; k++) {
+            const float *p = column[(k + 1) % 3], *q = column[(k + 2) % 3];
+            const float normal[3] = {p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]};
+            back[k] = normal[0] * moved[0] + normal[1] * moved[1] + normal[2] * moved[2];
+            if (k == 0) size = normal[0] * column[0][0] + normal[1] * column[0][1] + normal[2] * column[0][2];
+        }
+        size = fabsf(size) < FLAT ? (size < 0.0f ? -FLAT : FLAT) : size;
+        for (int c = 0; c < 3; c++) s->garment[c * wide + i] += back[c] / size;
+    }
+}
+
 /* How the garment hangs after a step; the code before it is in s->next. */
 static void drape(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
@@ -1074,6 +1113,7 @@ static void drape(const psi_model *m, psi_state *s) {
     const float *garment = decode(m, s, m->apart ? &f->felt_shapes : &m->shapes), still[3] = {0, 0, 0};
     for (int c = 0; c < 3; c++) memcpy(s->garment + c * wide, garment + c * count, count * sizeof(float));
     apply(s->blended, s->garment, still, wide, s->held);
+    if (f->relaxation) relax(f, s);
     for (int c = 0; c < 3; c++) {
         const float advance = s->translation[c] - s->translation[3 + c];
         float *x = s->position + c * wide, *v = s->velocity + c * wide, *now = s->held + c * wide;

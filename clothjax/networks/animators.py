@@ -14,7 +14,7 @@ from clothjax.networks.message_passing import Block
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.networks.psi import Psi, constant_inputs, next_code, window_inputs
-from clothjax.simulation.characters import Character, surface
+from clothjax.simulation.characters import Character, carried, surface
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array
@@ -157,14 +157,15 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
         constants = constant_inputs(character.betas, character.material, config.material)
 
         def step(inputs: StepInput) -> StepOutput:
-            def decode(code: Array) -> Array:
-                return phi.decode(garment, scene, character, code, inputs.window, config.model)
+            def skinned(code: Array) -> Array:
+                return phi.skinned(garment, scene, character, code, inputs.window, config.model)
 
             held, change = jax.lax.stop_gradient((inputs.state.latent, inputs.state.change))
             pulls = jax.lax.stop_gradient(
                 forces.reduced(
-                    decode,
+                    skinned,
                     held,
+                    carried(inputs.state.position, inputs.window),
                     inputs.time_step,
                     surface(scene, inputs.window.following),
                     scene.clusters,
@@ -174,7 +175,7 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
             )
             code = next_code(model["params"], scales, held, change, pulls, constants, config.stage2)
             code += jax.lax.stop_gradient(jnp.clip(code, scales.low, scales.high) - code)
-            return StepOutput(decode(code), code)
+            return StepOutput(phi.decode(garment, scene, character, code, inputs.window, config.model), code)
 
         return Animator(memory_size(scene, config), step)
 

@@ -91,22 +91,24 @@ def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConf
 def reduced(
     garment: Callable[[Array], Array],
     code: Array,
+    held: Array,
     step: TimeStep,
     surface: tuple[Array, Array] | None,
     clusters: Clusters | None,
     mesh: Mesh,
     config: PhysicsConfig,
 ) -> Array:
-    """Return the forces [3, L] in J on a code [L]: `on_vertices`, pulled back to the code.
+    """Return the forces [3, L] in J on a code [L]: `on_vertices` of the held garment, pulled back to the code.
 
     Args:
-        garment: from a code to vertices [V, 3] m at the next frame.
+        garment: from a code to vertices [V, 3] m at the next frame, before relaxation.
+        held: [V, 3] m, the garment of now in the pose of the next frame.
         step: the time step; its contact is not used.
         surface, clusters: as of `felt`; None where there is no body to touch.
     """
-    position, pullback = jax.vjp(garment, code)
+    _, pullback = jax.vjp(garment, code)
     edges = touching_edges(mesh, config)
-    touched = None if surface is None or clusters is None else felt(position, surface, clusters, edges)
+    touched = None if surface is None or clusters is None else felt(held, surface, clusters, edges)
     step = step._replace(contact=touched)
-    forces = on_vertices(position, step, mesh, config)
+    forces = on_vertices(held, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.body import skinning
 from clothjax.config import MaterialConfig, ModelConfig
 from clothjax.networks import decoder, graph_features, message_passing, mlp, normalisation
 from clothjax.networks.graph_features import Features
@@ -16,7 +15,9 @@ from clothjax.networks.mesh_convolution import Convolution
 from clothjax.networks.message_passing import MessagePassing
 from clothjax.networks.mlp import Dense, Params
 from clothjax.networks.normalisation import Statistics
+from clothjax.physics import relaxation
 from clothjax.physics.descent import descend, warm_start
+from clothjax.simulation import characters
 from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.rollout import StepInput, StepOutput
 from clothjax.simulation.scene import Scene
@@ -129,7 +130,7 @@ def step(
         guessed = garment(guess)
     else:
         guess = 0.0
-        guessed = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, state.position))
+        guessed = characters.carried(state.position, window)
     force = -jax.grad(potential)(guessed)
     seen = graph_features.compute(
         scene, character, state, window, inputs.time_step.contact, inputs.time_step.timestep, guessed, force,
@@ -138,7 +139,7 @@ def step(
     seen = jax.lax.stop_gradient(seen)
     output: Any = Phi(config, scene, block).apply(model, seen, guess)
     latent, displaced = output
-    return StepOutput(decoder.vertices(displaced, character.template, window.following.garment), latent, seen)
+    return StepOutput(shown(displaced, scene, character, window, config), latent, seen)
 
 
 def decode(
@@ -149,5 +150,27 @@ def decode(
     Args:
         garment: parameters of the decoder with its blend shapes.
     """
-    displaced = mlp.apply(decoder.of(garment, config), garment, latent, free(scene))
+    return shown(displacement(garment, scene, latent, config), scene, character, window, config)
+
+
+def skinned(
+    garment: Params, scene: Scene, character: Character, latent: Array, window: Window, config: ModelConfig
+) -> Array:
+    """Decode a code [L] to the vertices [V, 3] m of the following frame, before relaxation; arguments of `decode`."""
+    displaced = displacement(garment, scene, latent, config)
     return decoder.vertices(displaced, character.template, window.following.garment)
+
+
+def displacement(garment: Params, scene: Scene, latent: Array, config: ModelConfig) -> Array:
+    """Decode a code [L] to the canonical displacement [V, 3] m."""
+    return mlp.apply(decoder.of(garment, config), garment, latent, free(scene))
+
+
+def shown(displaced: Array, scene: Scene, character: Character, window: Window, config: ModelConfig) -> Array:
+    """Return the vertices [V, 3] m of the following frame, skinned and relaxed, of a displacement [V, 3] m."""
+    position = decoder.vertices(displaced, character.template, window.following.garment)
+    if config.relaxation == 0:
+        return position
+    mesh, rest, material = scene.mesh, character.rest, character.material
+    mobility = relaxation.mobility(rest, material, mesh, free(scene))
+    return relaxation.relaxed(position, mobility, rest, material, mesh, config.relaxation)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.networks import forces, psi
-from clothjax.physics import contact_search, incremental_potential
+from clothjax.physics import contact_search, incremental_potential, relaxation
 from clothjax.physics.incremental_potential import TimeStep
 from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network, Shown
 from clothjax.types import Array, Contact, Pose
@@ -59,9 +59,7 @@ def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, tr
 
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:
     """Return how the garment of a Psi with forces hangs for a code [L], at rest; arguments as of `shown`."""
-    felt, template = felt_garment(model)
-    garment = _canonical(model, latent, felt, template)
-    position = _skin(_rows(felt.weights, transforms), garment).T
+    garment, position = _hung(model, latent, transforms)
     return Drape(jnp.zeros_like(latent), garment, position, jnp.zeros_like(position), jnp.float32(0.0))
 
 
@@ -140,11 +138,23 @@ def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms:
         drape: before the step.
         transforms, advance: as of `predict`.
     """
-    felt, template = felt_garment(model)
-    garment = _canonical(model, latent, felt, template)
-    position = _skin(_rows(felt.weights, transforms), garment).T
+    garment, position = _hung(model, latent, transforms)
     velocity = position + advance[None] - drape.position
     return Drape(latent - before, garment, position, velocity, drape.still)
+
+
+def _hung(model: Model, latent: Array, transforms: Array) -> tuple[Array, Array]:
+    """Return the garment that feels, for a code [L]: [3, V] m in the canonical pose, and [V, 3] m posed and relaxed."""
+    felt, template = felt_garment(model)
+    garment, rows = _canonical(model, latent, felt, template), _rows(felt.weights, transforms)
+    position, cloth = _skin(rows, garment).T, model.wearer.cloth
+    assert cloth is not None
+    if cloth.mobility is None:
+        return garment, position
+    mesh, steps = _forces(model).mesh, model.config.model.relaxation
+    relaxed = relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, mesh, steps)
+    moved = skinning.unapply_direction(jnp.moveaxis(rows, 2, 0), relaxed - position)
+    return garment + moved.T, relaxed
 
 
 def _forces(model: Model) -> ForcePredictor:

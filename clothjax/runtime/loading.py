@@ -16,7 +16,7 @@ from clothjax.geometry import topology
 from clothjax.geometry.clusters import Clusters
 from clothjax.networks import normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
-from clothjax.physics import contact_search, energies
+from clothjax.physics import contact_search, energies, relaxation
 from clothjax.runtime import trained
 from clothjax.runtime.models import (
     Bounds,
@@ -117,7 +117,11 @@ def _arrays(
         assert touched is not None and clusters is not None and mesh is not None
         rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
         shaped = skinning.shaped_vertices(touched, betas)
-        cloth = Cloth(constants, areas * material.density, rest, material, shaped, None)
+        mobility = None
+        if config.model.relaxation > 0:
+            free = 1.0 - jnp.asarray(garment.pinned, jnp.float32)
+            mobility = relaxation.mobility(rest, material, mesh, free)
+        cloth = Cloth(constants, areas * material.density, rest, material, shaped, mobility, None)
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
         parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, clusters, weights, corrections, None)

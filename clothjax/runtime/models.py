@@ -124,6 +124,7 @@ class Cloth(NamedTuple):
     rest: Rest
     material: Material
     body: Array  # [B, 3] m in the canonical pose
+    mobility: Array | None  # [V] m/N, of `relaxation.mobility`; None without relaxation
     template: Array | None  # [3, V] m, of the garment that feels, if it is not the one that is shown
 
 
@@ -168,7 +169,7 @@ class Drape(NamedTuple):
     """
 
     change: Array  # [L] of the code in the last frame
-    garment: Array  # [3, V] m, in the canonical pose
+    garment: Array  # [3, V] m, carried back to the canonical pose
     position: Array  # [V, 3] m
     velocity: Array  # [V, 3] m per frame
     still: Array  # frames for which the body has stood still and nothing else has pushed, as a float

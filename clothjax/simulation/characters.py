@@ -124,3 +124,8 @@ def surface(scene: Scene, frame: Frame) -> tuple[Array, Array] | None:
 def skinned(character: Character, frame: Frame) -> Array:
     """Return the garment [V, 3] m at a frame by plain skinning, without any displacement."""
     return skinning.apply(frame.garment, character.template)
+
+
+def carried(position: Array, window: Window) -> Array:
+    """Return a garment [V, 3] m of the current frame as skinning carries it to the following one."""
+    return skinning.apply(window.following.garment, skinning.unapply(window.current.garment, position))

@@ -20,6 +20,7 @@ from clothjax.export import native, onnx, psi_ffi
 from clothjax.files import storage
 from clothjax.geometry import clusters
 from clothjax.networks import forces
+from clothjax.physics import relaxation
 from clothjax.runtime import drape, inference, models, specialise
 from clothjax.runtime.models import Layer, State
 from clothjax.types import Material, Pose
@@ -144,7 +145,7 @@ def test_c_inside_of_jax_is_c(library, packed, model, motion, tmp_path):
 
 @pytest.fixture(scope="module")
 def forced():
-    """Models of a random Psi with forces: a skip; a ReLU and no contact of edges; the first on a finer mesh."""
+    """Models of a random Psi with forces: a skip; a ReLU and no contact of edges; a finer mesh; one that relaxes."""
     skip, relu = random_force_psi(), random_force_psi(skip=False, without=("bending",), edge_contact=False)
     fine = storage.load_garment("tshirt_4000", skip.experiment.body)
     mesh = specialise.on_mesh(skip.model(), fine, np.zeros(10))
@@ -152,6 +153,7 @@ def forced():
         "skip": specialise.specialise(skip.model(betas=np.ones(10))),
         "relu": relu.model(material=Material(0.2, 2e4, 4e4, 10.0)),  # its bending is left out, or nothing else counts
         "mesh": specialise.specialise(mesh, blendshapes=7),
+        "relaxed": random_force_psi(relaxation=3).model(betas=np.ones(10)),
     }
 
 
@@ -173,7 +175,7 @@ def of_eight_bits(model):
     return dataclasses.replace(model, network=network)
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh"])
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed"])
 def test_c_with_forces_steps_as_the_model(forced, name, motion):
     """From the same states, in the median of frames: a vertex between two faces may take the other one."""
     if not psi_ffi.available():
@@ -410,6 +412,35 @@ def hurt(data, structure, rng):
         at = int(rng.choice(structure) if kind == 2 else rng.integers(len(data)))
         damaged[at] = rng.integers(256)
     return bytes(damaged)
+
+
+def test_clusters_of_few_vertices_are_filled_up_with_their_own(forced):
+    """Another cluster's vertex would be given what is near to this one."""
+    network = forced["relu"].network
+    own = np.arange(len(forced["relu"].wearer.cloth.mass)).reshape(-1, 2)
+    predictor = network.predictor._replace(clusters=network.predictor.clusters._replace(positions=own))
+    model = dataclasses.replace(forced["relu"], network=network._replace(predictor=predictor))
+    (rows,) = [array for array in native._arrays(model) if array.shape == (len(own), clusters.ASKED)]
+    assert [set(row) for row in rows.tolist()] == [set(row) for row in own.tolist()]
+
+
+def test_c_relaxes_as_the_model(forced, motion):
+    """Where the code does not change: all else would move the garment by more than the rounding of relaxation."""
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    model, pose = forced["relaxed"], at(motion, 3)
+    stiff = model.wearer.cloth._replace(mobility=jnp.zeros_like(model.wearer.cloth.mobility))
+    rigid = dataclasses.replace(model, wearer=model.wearer._replace(cloth=stiff))
+    state = inference.initial_state(model, at(motion, 2))
+    found, without = (psi_ffi.step(psi_ffi.pack(each), state, pose)[0].drape for each in (model, rigid))
+    transforms = inference._transforms(model, *kinematics(model, pose))
+    rows = drape._rows(model.network.weights, transforms)
+    cloth, mesh = model.wearer.cloth, model.network.predictor.mesh
+    expected = relaxation.relaxed(without.position, cloth.mobility, cloth.rest, cloth.material, mesh, 3)
+    moved = jnp.linalg.norm(expected - without.position, axis=1)
+    assert jnp.median(moved) > 2e-4 and moved.max() > 2e-3
+    np.testing.assert_allclose(found.position, expected, atol=2e-6)
+    np.testing.assert_allclose(drape._skin(rows, found.garment).T, found.position, atol=2e-6)
 
 
 LOST = """

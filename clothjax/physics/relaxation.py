@@ -1,0 +1,59 @@
+"""Relaxation of a decoded garment: a few Jacobi steps down its stretching energy (METHOD.md, Decoder).
+
+A linear span of blend shapes is stiffer than cloth: a fold in it stretches triangles, unless it has the small
+displacements in the plane that go with the fold. These steps find them. They reach a few edges far; what is longer is
+the code's.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from clothjax.geometry.vectors import at_corners
+from clothjax.physics import energies
+from clothjax.types import Array, Material, Mesh, Rest
+
+RATE = 0.8  # of a Jacobi step; above 1.3 the shortest waves of a regular mesh grow
+LONGEST = 0.005  # m, that a vertex moves in a step at most: far out of shape the cloth is many times as stiff
+
+
+def mobility(rest: Rest, material: Material, mesh: Mesh, free: Float[Array, " V"]) -> Float[Array, " V"]:
+    """Return how far a force moves each vertex in a step, [V] m/N: `RATE` over the stiffest direction of its own.
+
+    That is the diagonal of the stretching energy's Hessian at rest, sum A h (2 mu + lambda) |g|^2 over its faces, with
+    the gradient g of its shape function.
+
+    Args:
+        free: [V], 1 for a vertex that moves and 0 for a pinned one.
+    """
+    first, second = rest.inverse[:, 0], rest.inverse[:, 1]
+    gradients = jnp.stack([first, second, -(first + second)], axis=1)  # [F, 3, 2] 1/m, at the corners
+    stiffness = energies.THICKNESS * (2.0 * material.mu + material.lam) * rest.face_area
+    own = stiffness[:, None] * jnp.sum(gradients * gradients, axis=-1)
+    total = jnp.zeros_like(free).at[mesh.faces].add(own)
+    return jnp.where((free > 0) & (total > 0), RATE / jnp.where(total > 0, total, 1.0), 0.0)
+
+
+def relaxed(
+    position: Float[Array, "V 3"],
+    mobility: Float[Array, " V"],
+    rest: Rest,
+    material: Material,
+    mesh: Mesh,
+    steps: int,
+) -> Float[Array, "V 3"]:
+    """Return positions [V, 3] m after some steps down the stretching energy.
+
+    Args:
+        mobility: [V] m/N, of `mobility`.
+    """
+
+    def energy(x: Array) -> Array:
+        corners = at_corners(x, mesh.faces)
+        return jnp.sum(energies.stretching(corners, rest.inverse, rest.face_area, material.mu, material.lam))
+
+    for _ in range(steps):
+        move = -mobility[:, None] * jax.grad(energy)(position)
+        length = jnp.sum(move * move, axis=-1, keepdims=True)
+        position += move / jnp.sqrt(1.0 + length / LONGEST**2)
+    return position
