@@ -212,6 +212,7 @@ def make_collect(
 
     def collect(policy: Policy, simulations: Simulation, seed: int, progress: Callable[[int], None]) -> Round:
         keys = sampling.keys(seed, len(simulations.frame))
+        policy = jax.device_get(policy)  # one from a checkpoint would be compiled for again
         simulations, labels = sample((keys, simulations), (policy, clips), progress)
         flat = Labels(*(part.reshape(-1, *part.shape[2:]) for part in labels))
         (good,) = np.nonzero(np.asarray(usable(flat)))
