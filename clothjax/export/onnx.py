@@ -143,7 +143,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         following |= {f"next_{name}": shape for name, shape in drape.items()}
         felt = onnx_forces.parts(model)
         felt_garment = canonical(g, latent, model, felt.felt.shapes, felt.template)
-        skinned = onnx_forces.follow(g, model, latent, felt_garment, rows, advance)
+        felt_garment, skinned = onnx_forces.follow(g, model, latent, felt_garment, rows, advance)
         if predictor.felt is None:
             garment = felt_garment
     if output == "none":

@@ -12,6 +12,7 @@ from clothjax.export.onnx_graph import Graph
 from clothjax.geometry.clusters import TRIED, Clusters
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
+from clothjax.physics import relaxation
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Layer, Model, Shown
@@ -92,21 +93,51 @@ def next_code(
     return _predicted(g, model, it, pulls, _awake(g, turned, advance)), planes
 
 
-def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance: str) -> str:
-    """Name the next state of the garment; return its positions [N, 3, V] m, relative to the root's new place.
+def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance: str) -> tuple[str, str]:
+    """Name the next state of the garment; return its vertices [N, 3, V] m, canonical and relative to the root's place.
 
     Args:
         latent: [N, L] the next code.
-        garment: [N, 3 V] m, its garment in the canonical pose.
+        garment: [N, 3 V] m, its garment in the canonical pose, before relaxation.
         rows, advance: as of `next_code`.
     """
-    vertices = len(parts(model).cloth.mass)
+    cloth = parts(model).cloth
     g("Sub", latent, "latent", name="next_change")
-    canonical = g("Reshape", garment, np.array([0, 3, vertices], np.int64), name="next_garment")
-    placed = moved(g, rows, canonical)
+    shape = np.array([0, 3, len(cloth.mass)], np.int64)
+    if cloth.mobility is None:
+        canonical = g("Reshape", garment, shape, name="next_garment")
+        placed = moved(g, rows, canonical)
+    else:
+        decoded = g("Reshape", garment, shape)
+        skinned = moved(g, rows, decoded)
+        placed = _relaxed(g, model, skinned, np.asarray(cloth.mobility))
+        back = _unapplied(g, rows, g("Sub", placed, skinned))
+        canonical = g("Add", decoded, back, name="next_garment")
     position = g("Transpose", placed, perm=[0, 2, 1], name="next_position")
     g("Sub", g("Add", position, g("Transpose", advance, perm=[0, 2, 1])), "position", name="next_velocity")
-    return placed
+    return canonical, placed
+
+
+def _relaxed(g: Graph, model: Model, position: str, mobility: np.ndarray) -> str:
+    """Return positions [N, 3, V] m after the steps of `relaxation.relaxed`, for mobilities [V] m/N."""
+    it = parts(model)
+    faces, longest = np.asarray(it.predictor.mesh.faces), np.float32(relaxation.LONGEST**-2)
+    for _ in range(model.config.model.relaxation):
+        pull = _at_vertices(g, _stretching(g, it, position, faces), [faces], len(mobility))
+        move = g("Mul", pull, -mobility)
+        length = g("Sqrt", g("Add", g("Mul", _dot(g, move, move), longest), np.float32(1.0)))
+        position = g("Add", position, g("Div", move, length))
+    return position
+
+
+def _unapplied(g: Graph, rows: str, vectors: str) -> str:
+    """Return vectors [N, 3, V] carried back by transforms [N, 3, 4, V], as by `skinning.unapply_direction`."""
+    a, b, c = (g("Squeeze", g.slice(rows, 2, k, k + 1), np.array([2], np.int64)) for k in range(3))
+    normals = [_cross(g, *pair) for pair in ((b, c), (c, a), (a, b))]
+    determinant, least = _dot(g, a, normals[0]), np.float32(1e-3)
+    nearest = g("Where", g("Less", determinant, np.float32(0.0)), -least, least)
+    safe = g("Where", g("Less", g("Abs", determinant), least), nearest, determinant)
+    return g("Div", g("Concat", *(_dot(g, normal, vectors) for normal in normals), axis=1), safe)
 
 
 def pushed_out(g: Graph, model: Model, shown: str, planes: tuple[str, str], advance: str) -> str:
@@ -161,13 +192,18 @@ def _momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
 
 def _elasticity(g: Graph, model: Model, it: Parts, held: str) -> str:
     """Elastic forces [N, 3, V] in N: minus the gradient of the stretching and bending energies, in closed form."""
-    mesh, vertices = it.predictor.mesh, it.template.shape[1]
-    table = _around([np.asarray(mesh.faces), np.asarray(mesh.hinges)], vertices)
-    gradients = _stretching(g, it, held, np.asarray(mesh.faces))
-    gradients += _bending(g, model, it, held, np.asarray(mesh.hinges))
+    faces, hinges = (np.asarray(x) for x in (it.predictor.mesh.faces, it.predictor.mesh.hinges))
+    gradients = _stretching(g, it, held, faces)
+    gradients += _bending(g, model, it, held, hinges)
+    return g("Neg", _at_vertices(g, gradients, [faces, hinges], it.template.shape[1]))
+
+
+def _at_vertices(g: Graph, gradients: list[str], elements: list[np.ndarray], vertices: int) -> str:
+    """Sum the gradients [N, 3, n] for the corners of elements, in the order of `_around`, to those [N, 3, V]."""
+    table = _around(elements, vertices)
     rows = g("Pad", g("Concat", *gradients, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
     gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 3, *table.shape)
-    return g("Neg", g("ReduceSum", gathered, np.array([3], np.int64), keepdims=0))
+    return g("ReduceSum", gathered, np.array([3], np.int64), keepdims=0)
 
 
 def _around(elements: list[np.ndarray], vertices: int) -> np.ndarray:

@@ -28,8 +28,8 @@ from clothjax.runtime.models import (
 from clothjax.types import Material, Mesh, Rest
 
 # of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`. With forces, they
-# know no older one
-FORMAT = 3
+# know 3, where nothing relaxed, and no older one
+FORMAT, WITH_FORCES = 4, 3
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
 
 
@@ -64,7 +64,7 @@ def from_safetensors(path: str | Path) -> Model:
             arrays = {name: jnp.asarray(file.get_tensor(name)) for name in sorted(file.keys())}  # not a dict
         version = about.get("format", 1)
         damage.refuse_newer(path, version, FORMAT)
-        if version < FORMAT and "network.predictor.faces" in arrays:
+        if version < WITH_FORCES and "network.predictor.faces" in arrays:
             raise damage.OtherFormat(
                 f"{path}: its Psi with forces found what it touches in another way (format {version}); export it again"
             )
@@ -103,6 +103,7 @@ def from_safetensors(path: str | Path) -> Model:
             predictor = fields(ForcePredictor, own, **parts, corrections=arrays.get(f"{own}.corrections"))
             worn = "wearer.cloth"
             parts = {"rest": fields(Rest, f"{worn}.rest"), "material": fields(Material, f"{worn}.material")}
+            parts["mobility"] = arrays[f"{worn}.mobility"] if config.model.relaxation > 0 else None
             cloth = fields(Cloth, worn, **parts, template=arrays.get(f"{worn}.template"))
         else:
             parts = {"pose_bounds": bounds(f"{own}.pose_bounds"), "code": reader(f"{own}.code")}
