@@ -21,6 +21,7 @@ from clothjax.commands import convert
 from clothjax.export import frame, litert, native, onnx, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.networks import forces
+from clothjax.physics import relaxation
 from clothjax.runtime import inference, specialise
 from clothjax.types import Material, Motion, Pose
 
@@ -280,7 +281,8 @@ def test_safetensors_of_format_1_are_read(model, motion, tmp_path):
 
 @pytest.fixture(scope="module")
 def forced():
-    """Models of a random Psi with forces: a skip, a ReLU on the weights, another mesh, few shapes, few energies."""
+    """Models of a random Psi with forces: a skip, a ReLU on the weights, another mesh, few shapes, few energies, and
+    one that relaxes."""
     skip, relu = random_force_psi(), random_force_psi(skip=False)
     mesh = specialise.on_mesh(skip.model(), skip.experiment.garment, np.zeros(10))
     few = specialise.specialise(relu.model(betas=np.ones(10)), blendshapes=7)
@@ -290,10 +292,17 @@ def forced():
         "relu": relu.model(betas=np.ones(10)),
         "mesh": specialise.specialise(mesh),
         "few": few,
+        "relaxed": random_force_psi(relaxation=3).model(betas=np.ones(10)),
     }
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few", "limp"])
+def stiff(model):
+    """The same model without relaxation."""
+    cloth = model.wearer.cloth._replace(mobility=None)
+    return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
+
+
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few", "limp", "relaxed"])
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)
@@ -301,6 +310,55 @@ def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_pa
     several = onnx.to_onnx(model, tmp_path / "n.onnx", batch=None, output="none")
     names = {x.name for x in session(several).get_outputs()}
     assert {"next_garment", "next_velocity", "ok"} <= names and "vertices" not in names
+    if name == "relaxed":
+        assert apart(found, stiff(model), clip).max() > 1e-2
+
+
+def test_onnx_of_forces_relaxes_many_characters_seen_and_unseen(forced, motion, tmp_path):
+    """Two at once; the canonical garment is the relaxed one carried back, so that an engine's skinning relaxes it."""
+    model, several = forced["relaxed"], (3, 40)
+    poses = [Pose(jnp.asarray(motion.rotations[t]), jnp.asarray(motion.translation[t])) for t in several]
+    names, following = (*onnx.STATE, *onnx_forces.DRAPE), ("garment", "position", "velocity")
+    given = [np.concatenate(x) for x in zip(*(onnx.first_state(model, pose) for pose in poses))]
+    nearby = Pose(motion.rotations[[4, 41]], motion.translation[[4, 41]])
+    given = dict(zip((*names, *onnx.POSE), (*given, *nearby))) | {"external": np.zeros((2, 3), np.float32)}
+    given = {name: np.asarray(x, np.float32) for name, x in given.items()}
+    shown = {}
+    for output in ("world", "canonical", "none"):
+        run = session(onnx.to_onnx(model, tmp_path / f"{output}.onnx", batch=None, output=output))
+        last = "ok" if output == "none" else "vertices"
+        *state, shown[output] = run.run([*(f"next_{x}" for x in following), last], given)
+        for i in range(2):
+            pose = jax.tree.map(lambda x, i=i: jnp.asarray(x[i], jnp.float32), nearby)
+            after, vertices = inference.step(model, inference.initial_state(model, poses[i]), pose)
+            for name, mine in zip(following, state):
+                np.testing.assert_allclose(mine[i], getattr(after.drape, name), atol=2e-5)
+            if output == "world":
+                np.testing.assert_allclose(shown[output][i], vertices, atol=2e-5)
+    np.testing.assert_array_equal(shown["canonical"], state[0].transpose(0, 2, 1))
+
+
+def test_onnx_in_eight_bits_relaxes_in_full_precision(forced, motion, tmp_path, monkeypatch):
+    model, steps = forced["relaxed"], []
+    weights = specialise.ordinary_weights(model)
+    monkeypatch.setattr(specialise, "ordinary_weights", lambda _: weights)
+    pose = Pose(jnp.asarray(motion.rotations[5]), jnp.asarray(motion.translation[5]))
+    names, wanted = (*onnx.STATE, *onnx_forces.DRAPE, *onnx.POSE), ("next_latent", "next_position", "next_garment")
+    given = (*onnx.first_state(model, pose), *(np.asarray(x)[None] for x in pose))
+    given = dict(zip(names, given)) | {"external": np.zeros((1, 3), np.float32)}
+    for each in (model, stiff(model)):
+        run = session(onnx.to_onnx(each, tmp_path / "g.onnx", int8=True))
+        steps.append([x[0] for x in run.run(wanted, given)])
+    (latent, position, garment), (same, decoded, canonical) = steps
+    np.testing.assert_array_equal(latent, same)
+    cloth, mesh = model.wearer.cloth, model.network.predictor.mesh
+    relaxed = relaxation.relaxed(jnp.asarray(decoded), cloth.mobility, cloth.rest, cloth.material, mesh, 3)
+    np.testing.assert_allclose(position, relaxed, atol=2e-6)
+    assert np.abs(position - decoded).max() > 3e-3
+    transforms = skinning.joint_transforms(pose.rotations, model.wearer.joints, np.array(model.parents))
+    blended = skinning.blend(model.network.weights.T, transforms[np.array(model.moving)])
+    np.testing.assert_allclose(skinning.apply(blended, jnp.asarray(canonical.T)), decoded, atol=1e-5)
+    np.testing.assert_allclose(skinning.apply(blended, jnp.asarray(garment.T)), position, atol=1e-5)
 
 
 def test_onnx_of_forces_raises_planes_as_far_as_jax(forced, motion, tmp_path, monkeypatch):
@@ -400,7 +458,7 @@ def test_litert_refuses_forces_in_eight_bits(forced, tmp_path):
 
 def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
     clip = Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
-    for model in (forced["relu"], forced["mesh"]):
+    for model in (forced["relu"], forced["mesh"], forced["relaxed"]):
         path = stablehlo.to_stablehlo(model, tmp_path / "g.shlo")
         assert apart(stablehlo.run_stablehlo(path, model, clip), model, clip).max() < 1e-4
         again = safetensors.from_safetensors(safetensors.to_safetensors(model, tmp_path / "g.safetensors"))
@@ -418,6 +476,22 @@ def test_safetensors_of_forces_of_format_2_are_refused(forced, tmp_path):
     save_file(arrays, str(tmp_path / "old.safetensors"), metadata=about)
     with pytest.raises(ValueError, match=r"old\.safetensors: .* \(format 2\); export it again"):
         safetensors.from_safetensors(tmp_path / "old.safetensors")
+
+
+def test_safetensors_of_forces_without_relaxation_are_read_from_format_3_and_with_it_hold_the_mobility(
+    forced, tmp_path
+):
+    for name in ("skip", "relaxed"):
+        path = safetensors.to_safetensors(forced[name], tmp_path / f"{name}.safetensors")
+        with safetensors._library().safe_open(str(path), framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in sorted(file.keys()) if not name.endswith(".mobility")}
+            config, about = json.loads(file.metadata()["config"]), file.metadata() | {"format": "3"}
+        if name == "skip":
+            del config["model"]["relaxation"]
+        save_file(arrays, str(path), metadata=about | {"config": json.dumps(config)})
+    assert_same(safetensors.from_safetensors(tmp_path / "skip.safetensors"), forced["skip"])
+    with pytest.raises(ValueError, match=r"relaxed\.safetensors: not a whole model .*mobility"):
+        safetensors.from_safetensors(path)
 
 
 def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):

@@ -1,5 +1,7 @@
 """A Psi with forces in use: it is the one that was trained, on every mesh, and feels what pushes it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +38,17 @@ def motion(forced):
 
 def pose(motion, frame):
     return Pose(jnp.asarray(motion.rotations[frame], jnp.float32), jnp.asarray(motion.translation[frame]))
+
+
+@pytest.fixture(scope="module")
+def relaxing():
+    return random_force_psi(relaxation=3)
+
+
+def stiff(model):
+    """The same model without relaxation."""
+    cloth = model.wearer.cloth._replace(mobility=None)
+    return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
 def test_it_is_the_animator_of_training(forced, model, motion):
@@ -170,7 +183,27 @@ def test_specialised_it_is_the_same_and_with_fewer_shapes_nearly(forced, model, 
         assert 1e-6 < apart < 0.3 * np.abs(moved - expected).mean()
 
 
-def test_a_crowd_is_each_of_its_characters(forced, motion):
+def test_specialised_it_relaxes_as_before(relaxing, motion):
+    model = relaxing.model(betas=np.linspace(-1, 1, 10))
+    whole, _ = inference.animate(model, motion)
+    assert np.abs(whole - inference.animate(stiff(model), motion)[0]).max() > 1e-2
+    np.testing.assert_allclose(inference.animate(specialise.specialise(model), motion)[0], whole, atol=2e-5)
+    first = inference.initial_state(model, pose(motion, 0))
+    expected, moved = (inference.step(model, first, pose(motion, frame))[0].drape for frame in (1, 8))
+    few = specialise.specialise(model, blendshapes=8)
+    less = specialise.specialise(model, max_influences=2)
+    mesh = specialise.on_mesh(model, relaxing.experiment.garment, np.linspace(-1, 1, 10))
+    for each, share in ((few, 0.03), (less, 0.5), (mesh, 1e-3), (specialise.part(model, np.arange(500)), 1e-3)):
+        found = inference.step(each, first, pose(motion, 1))[0].drape
+        apart = np.abs(found.position - expected.position).mean()
+        assert apart < share * np.abs(moved.position - expected.position).mean()
+        unrelaxed = inference.step(stiff(each), first, pose(motion, 1))[0].drape
+        assert apart < np.abs(unrelaxed.position - expected.position).mean()
+
+
+@pytest.mark.parametrize("kind", ["forced", "relaxing"])
+def test_a_crowd_is_each_of_its_characters(kind, motion, request):
+    forced = request.getfixturevalue(kind)
     wearers = [forced.model(betas=np.full(10, i), material=Material(0.2 + 0.1 * i, 2e4, 4e4, 1e-5)) for i in range(2)]
     poses = Pose(jnp.asarray(motion.rotations[[0, 5]], jnp.float32), jnp.asarray(motion.translation[[0, 5]]))
     each = [inference.initial_state(model, jax.tree.map(lambda x, i=i: x[i], poses)) for i, model in enumerate(wearers)]
@@ -182,6 +215,9 @@ def test_a_crowd_is_each_of_its_characters(forced, motion):
         _, alone = inference.step(model, each[i], mine, external=external[i])
         np.testing.assert_allclose(together[i], alone, atol=1e-5)
     assert np.abs(together[1] - inference.step(wearers[1], each[1], mine)[1]).max() > 1e-4
+    if kind == "relaxing":
+        _, alone = inference.step(stiff(wearers[1]), each[1], mine, external=external[1])
+        assert np.abs(together[1] - alone).max() > 3e-3
 
 
 def test_it_stays_finite_whatever_comes_in(model, motion):
