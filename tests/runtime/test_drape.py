@@ -51,9 +51,11 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-def test_it_is_the_animator_of_training(forced, model, motion):
+@pytest.mark.parametrize("kind", ["forced", "relaxing"])
+def test_it_is_the_animator_of_training(kind, motion, request):
     """Frame by frame from the same state, over a dance."""
-    experiment = forced.experiment
+    forced = request.getfixturevalue(kind)
+    model, experiment = forced.model(betas=np.linspace(-1, 1, 10)), forced.experiment
     config, scene = experiment.config, experiment.scene
     character = characters.dress(
         scene, jnp.linspace(-1, 1, 10), jax.tree.map(jnp.float32, configured_material(config)), config.physics
@@ -123,9 +125,10 @@ def test_a_motion_is_animated_with_an_acceleration_for_each_frame(model, motion)
     assert np.abs(pushed[4] - calm[4]).max() > 1e-4
 
 
-def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_it(motion):
+@pytest.mark.parametrize("steps", [0, 3])
+def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_it(steps, motion):
     """A random network never does by itself. Its code is not clipped: a clipped change would not shrink."""
-    model = random_force_psi(limit=1e3).model()
+    model = random_force_psi(limit=1e3, relaxation=steps).model()
     state, changes = inference.initial_state(model, pose(motion, 0)), []
     state = state._replace(drape=state.drape._replace(still=jnp.float32(0)))
     wind, stands, tilted = jnp.array([1e-3, 0.0, 0.0]), pose(motion, 0), None
@@ -133,7 +136,7 @@ def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_
     def change(state, pose, external=None):
         return float(jnp.abs(inference.step(model, state, pose, False, external)[0].drape.change).max())
 
-    for frame in range(350):
+    for frame in range(370):
         awake = state._replace(drape=state.drape._replace(still=jnp.float32(0)))
         free = change(awake, stands)
         before = state
