@@ -57,7 +57,8 @@ def problem(toy):
 
 def reduced(garment, code, step, window, scene, **physics):
     surface = characters.surface(scene, window.following)
-    return forces.reduced(garment, code, step, surface, scene.clusters, scene.mesh, PhysicsConfig(**physics))
+    held = garment(code)
+    return forces.reduced(garment, code, held, step, surface, scene.clusters, scene.mesh, PhysicsConfig(**physics))
 
 
 def test_simulations_of_labels_are_more_often_soft_or_stiff_in_all_respects(toy):
@@ -169,6 +170,17 @@ def test_a_blank_psi_holds_the_code_and_labels_take_energy_from_it(round_of):
     np.testing.assert_array_equal(round_of.predicted, round_of.held)
     assert len(round_of.code) == 10 and (round_of.least < round_of.held).all()
     assert round_of.gap() == pytest.approx(1.0)
+
+
+def test_labels_are_compiled_for_once_whatever_a_policy_comes_from(toy, collect, finished, monkeypatch):
+    """One of a checkpoint is on a device, and one that was computed may be of weak type: neither is traced again."""
+    state = toy[3]
+    monkeypatch.delattr(labels, "draw_external")
+    on_device = jax.tree.map(lambda x: jax.device_put(1.0 * x, jax.devices()[0]), (state.params, state.normalizers))
+    weak = state.normalizers._replace(output=jnp.asarray(0.0))
+    for params, scales in (on_device, (state.params, weak)):
+        loose = state._replace(params=params, normalizers=scales)
+        assert len(collected(toy, collect, loose, finished.simulations).labels.code) == len(finished.labels.code)
 
 
 def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finished):
