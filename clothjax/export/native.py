@@ -143,7 +143,8 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(cloth.body[order].T)
     if predictor.felt is not None:
         yield _padded(felt.weights)
-        yield _padded(predictor.felt.nearest)
+        yield _padded(predictor.felt.around.T)
+        yield _padded(predictor.felt.shares.T)
     read, code = network.read, len(network.first)
     assert isinstance(read, Layer)
     inputs = len(scales.middle) - len(cloth.constants)

@@ -136,19 +136,21 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     given = {"latent": latent_shape, "history": history_shape}
     given |= {"rotations": (batch, count, 3, 3), "translation": (batch, 3)}
     following = {"next_latent": latent_shape, "next_history": history_shape, "ok": (batch,)}
-    vertices, garment, skinned = wearer.template.shape[1], "", ""
+    vertices, garment, skinned, decoded, canonical_felt = wearer.template.shape[1], "", "", "", ""
     if isinstance(predictor, ForcePredictor):
         drape = {name: (batch, *shape) for name, shape in onnx_forces.shapes(model).items()}
         given |= drape | {"external": (batch, 3)}
         following |= {f"next_{name}": shape for name, shape in drape.items()}
         felt = onnx_forces.parts(model)
-        felt_garment = canonical(g, latent, model, felt.felt.shapes, felt.template)
-        felt_garment, skinned = onnx_forces.follow(g, model, latent, felt_garment, rows, advance)
+        decoded = canonical(g, latent, model, felt.felt.shapes, felt.template)
+        canonical_felt, skinned = onnx_forces.follow(g, model, latent, decoded, rows, advance)
         if predictor.felt is None:
-            garment = felt_garment
+            garment = canonical_felt
     if output == "none":
         return given, following, g
     garment = garment or canonical(g, latent, model)
+    if isinstance(predictor, ForcePredictor):
+        garment = onnx_forces.shown_apart(g, model, garment, decoded, canonical_felt)
     if output == "world":
         if not isinstance(predictor, ForcePredictor) or predictor.felt is not None:
             skinned = g.skinned(garment, transforms, network.weights)

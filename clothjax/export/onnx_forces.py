@@ -118,6 +118,24 @@ def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance
     return canonical, placed
 
 
+def shown_apart(g: Graph, model: Model, garment: str, decoded: str, canonical: str) -> str:
+    """Return the garment [N, 3 V'] m that is shown where another feels, with its part of the relaxation of that one.
+
+    Args:
+        garment: [N, 3 V'] m, before.
+        decoded: [N, 3 V] m, the garment that feels before relaxation.
+        canonical: [N, 3, V] m, the same after it, of `follow`.
+    """
+    it = parts(model)
+    felt, count = it.predictor.felt, len(it.cloth.mass)
+    if felt is None or it.cloth.mobility is None:
+        return garment
+    moved = g("Sub", canonical, g.reshape(decoded, 3, count))
+    taken = g("Gather", moved, np.asarray(felt.around, np.int64), axis=2)  # [N, 3, V', 3]
+    taken = g("ReduceSum", g("Mul", taken, np.asarray(felt.shares)), np.array([3], np.int64), keepdims=0)
+    return g("Add", garment, g.reshape(taken, 3 * len(felt.around)))
+
+
 def _relaxed(g: Graph, model: Model, position: str, mobility: np.ndarray) -> str:
     """Return positions [N, 3, V] m after the steps of `relaxation.relaxed`, for mobilities [V] m/N."""
     it = parts(model)

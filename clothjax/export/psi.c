@@ -57,7 +57,8 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     const int32_t *face, *cluster, *edge;             /* [3][faces], by PATCH; [clusters][NEIGHBOURS]; [2][edges] */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
     const float *weight;                              /* [moving][vertices] */
-    const int32_t *nearest;                           /* [vertices that are shown], the vertex that feels at each */
+    const int32_t *around;                            /* [3][vertices that are shown], those that feel, nearest first */
+    const float *share;                               /* [3] ... how much of their relaxation it takes */
     const float *middle, *inverse_spread;             /* of the inputs [(2 + KINDS) code], over BOUND */
     layer unshape, unmix, undecode[MOST_HIDDEN], first; /* transposed shapes, mix, layers of the decoder */
     layer read_fine;                                  /* the rest of the decoder's first, in sixteen bits */
@@ -256,7 +257,8 @@ static void read_forces(reader *r, psi_model *m) {
     f->body_weight = floats(r, (size_t)m->moving * padded(f->body));
     f->body_rest = floats(r, 3 * (size_t)padded(f->body));
     f->weight = m->apart ? floats(r, (size_t)m->moving * padded(f->vertices)) : m->weight;
-    if (m->apart) f->nearest = indices(r, padded(m->vertices), f->vertices);
+    if (m->apart) f->around = indices(r, 3 * padded(m->vertices), f->vertices);
+    if (m->apart) f->share = floats(r, 3 * (size_t)padded(m->vertices));
     f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
     f->inverse_spread = floats(r, (2 + KINDS) * (size_t)m->code);
     f->read_fine = read_layer(r, m);
@@ -504,7 +506,7 @@ static void first_of_decoder(const psi_model *m, psi_state *s, float *read, floa
 }
 
 /* The garment in the canonical pose [3][vertices]. */
-static const float *decode(const psi_model *m, psi_state *s, const layer *shapes) {
+static float *decode(const psi_model *m, psi_state *s, const layer *shapes) {
     float *x = s->rows[0], *y = s->rows[1], *read = s->rows[2];
     const int32_t wide = m->decode[0].inputs, last = m->decode[m->decoder - 1].outputs;
     first_of_decoder(m, s, read, x);
@@ -1073,10 +1075,11 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;
 }
 
-/* Relaxes the garment that is posed in s->held, and moves s->garment by as much: relaxation.relaxed, drape._hung. */
+/* Relaxes the garment that is posed in s->held: relaxation.relaxed, drape._hung. s->garment moves by as much, which
+ * stays in the last rows of s->force. */
 static void relax(const forces *f, psi_state *s) {
     const size_t wide = padded(f->vertices);
-    float *push = s->force, *before = s->force + 3 * wide;
+    float *push = s->force, *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
     memcpy(before, s->held, 3 * wide * sizeof(float));
     for (int32_t n = 0; n < f->relaxation; n++) {
         float *x = s->held, *y = x + wide, *z = y + wide;
@@ -1102,7 +1105,7 @@ static void relax(const forces *f, psi_state *s) {
             if (k == 0) size = normal[0] * column[0][0] + normal[1] * column[0][1] + normal[2] * column[0][2];
         }
         size = fabsf(size) < FLAT ? (size < 0.0f ? -FLAT : FLAT) : size;
-        for (int c = 0; c < 3; c++) s->garment[c * wide + i] += back[c] / size;
+        for (int c = 0; c < 3; c++) s->garment[c * wide + i] += canonical[c * wide + i] = back[c] / size;
     }
 }
 
@@ -1122,6 +1125,18 @@ static void drape(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < m->code; i++) s->change[i] = s->latent[i] - s->next[i];
 }
 
+/* The garment that is shown where another feels: it takes part in the relaxation of that one. */
+static const float *decode_apart(const psi_model *m, psi_state *s) {
+    const size_t count = m->vertices, rows = padded(m->vertices), wide = padded(m->f.vertices);
+    const float *moved = s->force + 6 * wide;
+    float *garment = decode(m, s, &m->shapes);
+    for (int c = 0; m->f.relaxation && c < 3; c++)
+        for (size_t v = 0; v < count; v++)
+            for (int k = 0; k < 3; k++)
+                garment[c * count + v] += m->f.share[k * rows + v] * moved[c * wide + m->f.around[k * rows + v]];
+    return garment;
+}
+
 static void show(const psi_model *m, const psi_state *s, float *vertices) {
     const size_t count = m->f.vertices, wide = padded(m->f.vertices);
     for (size_t v = 0; v < count; v++)
@@ -1133,7 +1148,7 @@ static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
     const float *last = s->translation + 3;
     const size_t wide = padded(m->f.vertices);
     for (int32_t v = 0; v < m->vertices; v++) {
-        const float *plane = s->plane + (m->apart ? m->f.nearest[v] : v);
+        const float *plane = s->plane + (m->apart ? m->f.around[v] : v);
         float *x = vertices + 3 * v, gap = -plane[3 * wide];
         for (int c = 0; c < 3; c++) gap += plane[c * wide] * (x[c] - last[c]);
         const float depth = gap < m->f.offset ? m->f.offset - gap : 0.0f, push = depth < m->f.deepest ? depth : m->f.deepest;
@@ -1182,7 +1197,7 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     if (vertices && m->forced && !m->apart) {
         show(m, s, vertices);
     } else if (vertices) {
-        skin(m, s, decode(m, s, &m->shapes), vertices);
+        skin(m, s, m->forced ? decode_apart(m, s) : decode(m, s, &m->shapes), vertices);
     }
     if (vertices && m->forced) push_out(m, s, vertices);
     s->outside = (finite && s->pushed ? 0 : PSI_NOT_FINITE) | (ordinary ? 0 : PSI_POSE) | (m->known ? 0 : PSI_WEARER) |

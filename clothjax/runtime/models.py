@@ -67,7 +67,13 @@ class Felt(NamedTuple):
 
     shapes: Array  # [K, 3 V] m, as of `Shown`
     weights: Array  # [J', V]
-    nearest: Array  # [V'] int32, the vertex at each one that is shown
+    around: Array  # [V', 3] int32, the corners of its face that is nearest to each vertex that is shown, and ...
+    shares: Array  # [V', 3] ... how much of their relaxation this one takes; the first share is the largest
+
+    @property
+    def nearest(self) -> Array:
+        """Return the vertex [V'] at each one that is shown."""
+        return self.around[:, 0]
 
 
 class ForcePredictor(NamedTuple):

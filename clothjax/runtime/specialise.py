@@ -174,7 +174,7 @@ def part(model: Model, vertices: Array) -> Model:
     number = np.full(model.wearer.template.shape[-1], -1)
     number[vertices] = np.arange(len(vertices))
     faces = number[np.asarray(model.faces)]
-    model = _feeling_apart(model, vertices)
+    model = _feeling_apart(model, np.repeat(vertices[:, None], 3, axis=1), np.eye(3)[np.zeros(len(vertices), int)])
     network = model.network._replace(
         shapes=_rows(model.network)[:, :, vertices].reshape(len(model.network.shapes), -1),
         weights=model.network.weights[:, vertices],
@@ -187,20 +187,22 @@ def part(model: Model, vertices: Array) -> Model:
     )
 
 
-def _feeling_apart(model: Model, nearest: np.ndarray) -> Model:
+def _feeling_apart(model: Model, around: np.ndarray, shares: np.ndarray) -> Model:
     """Return a model that goes on to feel the forces on the garment of now when another is shown.
 
     Args:
-        nearest: [V'] the vertex of the garment that is shown now at each of the other.
+        around, shares: [V', 3] as of `Felt`, of the garment that is shown now at each vertex of the other.
     """
     predictor, cloth = model.network.predictor, model.wearer.cloth
     if isinstance(predictor, PosePredictor) or cloth is None:
         return model
     if predictor.felt is None:
-        felt = Felt(model.network.shapes, model.network.weights, jnp.asarray(nearest, jnp.int32))
+        rows = jnp.asarray(around, jnp.int32), jnp.asarray(shares, jnp.float32)
+        felt = Felt(model.network.shapes, model.network.weights, *rows)
         cloth = cloth._replace(template=model.wearer.template)
     else:
-        felt = predictor.felt._replace(nearest=predictor.felt.nearest[nearest])
+        kept = around[:, 0]  # each is a vertex of the garment that is shown now
+        felt = predictor.felt._replace(around=predictor.felt.around[kept], shares=predictor.felt.shares[kept])
     predictor = predictor._replace(felt=felt)
     return dataclasses.replace(
         model, network=model.network._replace(predictor=predictor), wearer=model.wearer._replace(cloth=cloth)
@@ -229,7 +231,9 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     corners = np.asarray(_rows(model.network))[:, :, faces[face]]
     shapes = np.einsum("kcvi,vi->kcv", corners, weights)
     shapes[:, :, np.asarray(garment.pinned)] = 0.0
-    model = _feeling_apart(model, faces[face, weights.argmax(axis=1)])
+    nearest_first = np.argsort(-weights, axis=1, kind="stable")
+    around, shares = (np.take_along_axis(rows, nearest_first, axis=1) for rows in (faces[face], weights))
+    model = _feeling_apart(model, around, np.where(np.asarray(garment.pinned)[:, None], 0.0, shares))
     network = model.network._replace(
         shapes=jnp.asarray(shapes.reshape(len(shapes), -1)),
         weights=jnp.asarray(garment.weights).T[np.array(model.moving)],

@@ -20,6 +20,7 @@ from clothjax.body import skinning
 from clothjax.commands import convert
 from clothjax.export import frame, litert, native, onnx, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
+from clothjax.files import storage
 from clothjax.networks import forces
 from clothjax.physics import relaxation
 from clothjax.runtime import inference, specialise
@@ -282,17 +283,21 @@ def test_safetensors_of_format_1_are_read(model, motion, tmp_path):
 @pytest.fixture(scope="module")
 def forced():
     """Models of a random Psi with forces: a skip, a ReLU on the weights, another mesh, few shapes, few energies, and
-    one that relaxes."""
+    one that relaxes, also on a finer mesh."""
     skip, relu = random_force_psi(), random_force_psi(skip=False)
     mesh = specialise.on_mesh(skip.model(), skip.experiment.garment, np.zeros(10))
     few = specialise.specialise(relu.model(betas=np.ones(10)), blendshapes=7)
+    relaxed = random_force_psi(relaxation=3).model(betas=np.ones(10))
     return {
         "limp": random_force_psi(without=("bending", "gravity"), edge_contact=False).model(material=STIFF),
         "skip": skip.model(),
         "relu": relu.model(betas=np.ones(10)),
         "mesh": specialise.specialise(mesh),
         "few": few,
-        "relaxed": random_force_psi(relaxation=3).model(betas=np.ones(10)),
+        "relaxed": relaxed,
+        "relaxed mesh": specialise.on_mesh(
+            relaxed, storage.load_garment("tshirt_4000", skip.experiment.body), np.ones(10)
+        ),
     }
 
 
@@ -302,7 +307,7 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few", "limp", "relaxed"])
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh"])
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)
@@ -310,7 +315,7 @@ def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_pa
     several = onnx.to_onnx(model, tmp_path / "n.onnx", batch=None, output="none")
     names = {x.name for x in session(several).get_outputs()}
     assert {"next_garment", "next_velocity", "ok"} <= names and "vertices" not in names
-    if name == "relaxed":
+    if name.startswith("relaxed"):
         assert apart(found, stiff(model), clip).max() > 1e-2
 
 

@@ -149,11 +149,13 @@ def forced():
     skip, relu = random_force_psi(), random_force_psi(skip=False, without=("bending",), edge_contact=False)
     fine = storage.load_garment("tshirt_4000", skip.experiment.body)
     mesh = specialise.on_mesh(skip.model(), fine, np.zeros(10))
+    relaxed = random_force_psi(relaxation=3).model(betas=np.ones(10))
     return {
         "skip": specialise.specialise(skip.model(betas=np.ones(10))),
         "relu": relu.model(material=Material(0.2, 2e4, 4e4, 10.0)),  # its bending is left out, or nothing else counts
         "mesh": specialise.specialise(mesh, blendshapes=7),
-        "relaxed": random_force_psi(relaxation=3).model(betas=np.ones(10)),
+        "relaxed": relaxed,
+        "relaxed mesh": specialise.on_mesh(relaxed, fine, np.ones(10)),
     }
 
 
@@ -175,7 +177,7 @@ def of_eight_bits(model):
     return dataclasses.replace(model, network=network)
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed"])
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed", "relaxed mesh"])
 def test_c_with_forces_steps_as_the_model(forced, name, motion):
     """From the same states, in the median of frames: a vertex between two faces may take the other one."""
     if not psi_ffi.available():
@@ -289,7 +291,7 @@ def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path)
     arrays, path = list(native._arrays(forced["mesh"])), tmp_path / "g.psi"
     whole = native.as_bytes(arrays)
     tables = [i for i, array in enumerate(arrays) if array.dtype == np.int32 and array.ndim == 2]
-    assert len(tables) == 5  # corners, hinges, faces of the body, its clusters, edges
+    assert len(tables) == 6  # corners, hinges, faces of the body, its clusters, edges, what is around the shown
     wrong = [whole[:cut] for cut in np.linspace(100, len(whole) - 64, 40).astype(int)]
     for table in tables:
         for value in (-1, 1 << 18):

@@ -160,13 +160,18 @@ def test_a_psi_without_forces_refuses_an_acceleration(motion):
         inference.step(model, state, pose(motion, 1), external=jnp.zeros(3))
 
 
-def test_a_part_and_another_mesh_feel_what_the_whole_feels(forced, model, motion):
+@pytest.mark.parametrize("kind", ["forced", "relaxing"])
+def test_a_part_and_another_mesh_feel_what_the_whole_feels(kind, motion, request):
+    forced = request.getfixturevalue(kind)
+    model = forced.model(betas=np.linspace(-1, 1, 10))
     whole, _ = inference.animate(model, motion)
     vertices = np.arange(0, 500)
     seen, _ = inference.animate(specialise.part(model, vertices), motion)
     np.testing.assert_allclose(seen, whole[:, vertices], atol=1e-5)
     mesh = specialise.on_mesh(model, forced.experiment.garment, np.linspace(-1, 1, 10))  # the same one, as another
     assert mesh.network.predictor.felt is not None
+    again, _ = inference.animate(specialise.part(mesh, vertices), motion)
+    np.testing.assert_allclose(again, whole[:, vertices], atol=1e-5)
     np.testing.assert_allclose(inference.animate(mesh, motion)[0], whole, atol=1e-5)
 
 
