@@ -30,11 +30,11 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
         about: more entries for the JSON.
 
     Raises:
-        ValueError: for a model with forces in eight bits, which are too few for the whitening.
+        ValueError: for a model with forces, whose search for the nearest face the converter does not know.
         ImportError: if TensorFlow is not installed.
     """
-    if int8 and isinstance(model.network.predictor, ForcePredictor):
-        raise ValueError("LiteRT has no model with forces in eight bits; leave --int8 out, or take ONNX or plain C")
+    if isinstance(model.network.predictor, ForcePredictor):
+        raise ValueError("LiteRT cannot run a model with forces: take ONNX or plain C, which phones run too")
     try:
         import tensorflow  # pyright: ignore[reportMissingModuleSource]  # not in the environment: too large
         from jax.experimental import jax2tf

@@ -457,9 +457,10 @@ def test_the_first_state_is_as_the_json_says(forced, name, motion):
     assert "Run 60 times" in frame.describe(model)["first_state"]
 
 
-def test_litert_refuses_forces_in_eight_bits(forced, tmp_path):
-    with pytest.raises(ValueError, match="LiteRT has no model with forces in eight bits"):
-        litert.to_litert(forced["skip"], tmp_path / "g.tflite", int8=True)
+@pytest.mark.parametrize("int8", [False, True])
+def test_litert_refuses_forces(forced, tmp_path, int8):
+    with pytest.raises(ValueError, match="LiteRT cannot run a model with forces: take ONNX or plain C"):
+        litert.to_litert(forced["skip"], tmp_path / "g.tflite", int8=int8)
 
 
 def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
