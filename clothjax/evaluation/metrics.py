@@ -135,8 +135,8 @@ def gaps(measures: list[StepMeasure]) -> dict[str, float]:
 
     energy_gap = (E - E_min) / (E_skinned - E_min): 0 for the solver, 1 for plain skinning. hold_gap, the persistence
     gap, has E_hold in the place of E_skinned: 1 for no dynamics at all. span_gap is the hold_gap of the minimum in the
-    span of the blend shapes. Means are ratios of summed energies, so a frame whose garment hardly moves does not
-    outweigh the others; medians are of single frames.
+    span of the blend shapes, without relaxation. Means are ratios of summed energies, so a frame whose garment hardly
+    moves does not outweigh the others; medians are of single frames.
     """
     taken, minimum, skinned, hold = (
         np.array([getattr(m, name) for m in measures]) for name in ("energy", "minimum", "skinned", "hold")
