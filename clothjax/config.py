@@ -165,7 +165,7 @@ class ModelConfig:
     """Steps of L-BFGS that find the guess."""
     descent_samples: int = 24
     """Rollouts of Phi, at whose last frames the Hessian of the potential by the code is evaluated. The mean Hessian
-    preconditions the descent. 0: the Hessian of the garment at rest takes its place."""
+    preconditions the descent. 0: the Hessian of the garment at rest, unrelaxed, takes its place."""
     descent_damping: float = 0.02
     """J, added to the eigenvalues of that Hessian before it is inverted. It shortens steps: folds are stiffer than the
     mean Hessian says."""

@@ -8,7 +8,7 @@
     onnx          ONNX Runtime 1.15 and newer, and engines built on it. --int8 writes eight bits; --output canonical
                   is for engines that skin the garment, --output none for a garment that nobody sees
     stablehlo     any process with jax or XLA, on CPU, GPU or TPU, without clothjax
-    litert        LiteRT (TensorFlow Lite), as on phones; --int8 writes eight bits
+    litert        LiteRT (TensorFlow Lite), as on phones, of a model without forces; --int8 writes eight bits
     c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
     safetensors   the arrays alone, for those who build a runtime
 

@@ -34,7 +34,9 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
         ImportError: if TensorFlow is not installed.
     """
     if isinstance(model.network.predictor, ForcePredictor):
-        raise ValueError("LiteRT cannot run a model with forces: take ONNX or plain C, which phones run too")
+        raise ValueError(
+            "LiteRT cannot run a model with forces: take ONNX or plain C, which phones run too, or StableHLO"
+        )
     try:
         import tensorflow  # pyright: ignore[reportMissingModuleSource]  # not in the environment: too large
         from jax.experimental import jax2tf

@@ -160,12 +160,14 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
             def skinned(code: Array) -> Array:
                 return phi.skinned(garment, scene, character, code, inputs.window, config.model)
 
-            held, change = jax.lax.stop_gradient((inputs.state.latent, inputs.state.change))
+            held, change, position = jax.lax.stop_gradient(
+                (inputs.state.latent, inputs.state.change, inputs.state.position)
+            )
             pulls = jax.lax.stop_gradient(
                 forces.reduced(
                     skinned,
                     held,
-                    carried(inputs.state.position, inputs.window),
+                    carried(position, inputs.window),
                     inputs.time_step,
                     surface(scene, inputs.window.following),
                     scene.clusters,

@@ -201,7 +201,7 @@ def _feeling_apart(model: Model, around: np.ndarray, shares: np.ndarray) -> Mode
         felt = Felt(model.network.shapes, model.network.weights, *rows)
         cloth = cloth._replace(template=model.wearer.template)
     else:
-        kept = around[:, 0]  # each is a vertex of the garment that is shown now
+        kept = around[:, 0]  # of a part, so each is a vertex of the garment that is shown now
         felt = predictor.felt._replace(around=predictor.felt.around[kept], shares=predictor.felt.shares[kept])
     predictor = predictor._replace(felt=felt)
     return dataclasses.replace(
@@ -219,8 +219,11 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
         betas: [S] of the model's character.
 
     Raises:
-        ValueError: for a specialised model, because the mesh may need the parts that are gone.
+        ValueError: for a specialised model, because the mesh may need the parts that are gone, and for one that is on
+            another mesh, or a part, already.
     """
+    if isinstance(model.network.predictor, ForcePredictor) and model.network.predictor.felt is not None:
+        raise ValueError("this model shows another mesh, or a part, already: begin with the one that was loaded")
     if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
         raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))

@@ -488,15 +488,20 @@ def test_safetensors_of_forces_of_format_2_are_refused(forced, tmp_path):
 def test_safetensors_of_forces_without_relaxation_are_read_from_format_3_and_with_it_hold_the_mobility(
     forced, tmp_path
 ):
-    for name in ("skip", "relaxed"):
-        path = safetensors.to_safetensors(forced[name], tmp_path / f"{name}.safetensors")
+    part = specialise.part(forced["skip"], np.arange(50))
+    for name, model in (("skip", forced["skip"]), ("part", part), ("relaxed", forced["relaxed"])):
+        path = safetensors.to_safetensors(model, tmp_path / f"{name}.safetensors")
         with safetensors._library().safe_open(str(path), framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in sorted(file.keys()) if not name.endswith(".mobility")}
             config, about = json.loads(file.metadata()["config"]), file.metadata() | {"format": "3"}
-        if name == "skip":
+        if name != "relaxed":
             del config["model"]["relaxation"]
+        if name == "part":
+            del arrays["network.predictor.felt.shares"]
+            arrays["network.predictor.felt.nearest"] = arrays.pop("network.predictor.felt.around")[:, 0].copy()
         save_file(arrays, str(path), metadata=about | {"config": json.dumps(config)})
     assert_same(safetensors.from_safetensors(tmp_path / "skip.safetensors"), forced["skip"])
+    assert_same(safetensors.from_safetensors(tmp_path / "part.safetensors"), part)
     with pytest.raises(ValueError, match=r"relaxed\.safetensors: not a whole model .*mobility"):
         safetensors.from_safetensors(path)
 

@@ -70,6 +70,20 @@ def test_forces_need_a_moving_body_and_phis_descent(other, reason):
         configuration.from_dict(config_module.Config, {"stage2": {"forces": True}} | other)
 
 
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"model": {"relaxation": 2}}, r"model\.relaxation needs stage2\.forces"),
+        ({"model": {"relaxation": 17}, "stage2": {"forces": True}}, "relaxation must be 0 to 16, got 17"),
+        ({"model": {"relaxation": -1}, "stage2": {"forces": True}}, "relaxation must be 0 to 16, got -1"),
+    ],
+)
+def test_relaxation_needs_forces_and_few_steps(values, reason):
+    with pytest.raises(ValueError, match=reason):
+        configuration.from_dict(config_module.Config, values)
+    assert configuration.from_dict(config_module.Config, {"model": {"relaxation": 16}, "stage2": {"forces": True}})
+
+
 SECTIONS = [cls for cls in vars(config_module).values() if hasattr(cls, "RETIRED")]
 
 

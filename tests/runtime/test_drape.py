@@ -173,6 +173,8 @@ def test_a_part_and_another_mesh_feel_what_the_whole_feels(kind, motion, request
     again, _ = inference.animate(specialise.part(mesh, vertices), motion)
     np.testing.assert_allclose(again, whole[:, vertices], atol=1e-5)
     np.testing.assert_allclose(inference.animate(mesh, motion)[0], whole, atol=1e-5)
+    with pytest.raises(ValueError, match="shows another mesh, or a part, already"):
+        specialise.on_mesh(mesh, forced.experiment.garment, np.zeros(10))
 
 
 def test_specialised_it_is_the_same_and_with_fewer_shapes_nearly(forced, model, motion):

@@ -55,6 +55,41 @@ def problem(toy):
     return scene, config, lambda z: garment(latent=z), step, window, code
 
 
+def test_labels_are_of_what_a_psi_that_relaxes_sees_and_decodes(toy):
+    """The first frame: the held garment is that of now, pulled back as if nothing relaxed; energies are relaxed."""
+    experiment, clips, params, state = toy
+    config = experiment.config
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, relaxation=2),
+        labels=dataclasses.replace(config.labels, frames=1, descent_steps=1),
+    )
+    scene, one = experiment.scene, labels.begin_one(jax.random.key(5), experiment.scene, clips, config)
+    rough = 2e-3 * jax.random.normal(jax.random.key(6), one.cloth.position.shape)
+    one = one._replace(cloth=one.cloth._replace(position=one.cloth.position + rough))  # not what any code decodes to
+    policy = labels.Policy(state.params, state.normalizers, params["garment"], params["inverse_hessian"])
+    found = jax.jit(labels.make_segment(scene, config))((jax.random.key(7), one), policy, clips).labels
+    character = pool.dressed(scene, one.betas, one.material, config)
+    matched = []
+    for poses in (motion_clips.poses(clips, one.frame), motion_clips.standing(motion_clips.poses(clips, one.frame))):
+        window = characters.window(scene, character, poses)
+        step = time_step.time_step(scene, character, one.cloth, window, jnp.float32(1 / config.fps), config)
+        given = (params["garment"], scene, character, one.cloth.latent, window, config.model)
+        pulls = forces.reduced(
+            lambda z, window=window: phi.skinned(params["garment"], scene, character, z, window, config.model),
+            one.cloth.latent, characters.carried(one.cloth.position, window), step,
+            characters.surface(scene, window.following), scene.clusters, scene.mesh, config.physics,
+        )  # fmt: skip
+        least = incremental_potential.potential(phi.decode(*given), step, scene.mesh, config.physics)
+        matched.append(
+            np.allclose(found.forces[0], pulls, rtol=1e-3, atol=1e-4 * np.abs(pulls).max())
+            and np.allclose(found.held[0], least, rtol=1e-4)
+        )
+        unrelaxed = incremental_potential.potential(phi.skinned(*given), step, scene.mesh, config.physics)
+        assert abs(least / unrelaxed - 1) > 1e-3
+    assert sum(matched) == 1  # the body moves, or it holds its pose
+
+
 def reduced(garment, code, step, window, scene, **physics):
     surface = characters.surface(scene, window.following)
     held = garment(code)
