@@ -30,7 +30,7 @@ def mobility(rest: Rest, material: Material, mesh: Mesh, free: Float[Array, " V"
     gradients = jnp.stack([first, second, -(first + second)], axis=1)  # [F, 3, 2] 1/m, at the corners
     stiffness = energies.THICKNESS * (2.0 * material.mu + material.lam) * rest.face_area
     own = stiffness[:, None] * jnp.sum(gradients * gradients, axis=-1)
-    total = jnp.zeros_like(free).at[mesh.faces].add(own)
+    total = jnp.zeros(free.shape, own.dtype).at[mesh.faces].add(own)
     return jnp.where((free > 0) & (total > 0), RATE / jnp.where(total > 0, total, 1.0), 0.0)
 
 
