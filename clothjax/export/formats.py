@@ -11,7 +11,7 @@ import numpy as np
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
-from clothjax.runtime.models import ForcePredictor, Model
+from clothjax.runtime.models import Model
 from clothjax.types import Motion
 
 
@@ -42,8 +42,8 @@ def _run_onnx(path: Path, model: Model, motion: Motion, options: Options) -> np.
 
 def _of_litert(model: Model, options: Options) -> Model:
     """Return the model whose code the file carries."""
-    forced = isinstance(model.network.predictor, ForcePredictor)  # it will be refused
-    return specialise.equalised(model) if options.int8 and not forced else model
+    litert.refuse_forces(model)  # before any work
+    return specialise.equalised(model) if options.int8 else model
 
 
 def _write_litert(model: Model, path: Path, options: Options, about: dict) -> None:

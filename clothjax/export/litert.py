@@ -33,10 +33,7 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
         ValueError: for a model with forces, whose search for the nearest face the converter does not know.
         ImportError: if TensorFlow is not installed.
     """
-    if isinstance(model.network.predictor, ForcePredictor):
-        raise ValueError(
-            "LiteRT cannot run a model with forces: take ONNX or plain C, which phones run too, or StableHLO"
-        )
+    refuse_forces(model)
     try:
         import tensorflow  # pyright: ignore[reportMissingModuleSource]  # not in the environment: too large
         from jax.experimental import jax2tf
@@ -61,6 +58,14 @@ def to_litert(model: Model, path: str | Path, *, int8: bool = False, about: dict
     return path
 
 
+def refuse_forces(model: Model) -> None:
+    """Raise a ValueError for a model with forces."""
+    if isinstance(model.network.predictor, ForcePredictor):
+        raise ValueError(
+            "LiteRT cannot run a model with forces: take ONNX or plain C, which phones run too, or StableHLO"
+        )
+
+
 def _partly_quantised(model: Model) -> Callable:
     """Return `frame.function` with the pose kernel and the skinning weights hidden from the converter.
 
@@ -71,8 +76,8 @@ def _partly_quantised(model: Model) -> Callable:
     def hidden(latent: Array, *others: Array) -> tuple:
         zero = jnp.where(jnp.abs(latent[0]) < 0.0, 1.0, 0.0)  # also of NaN
         predictor = model.network.predictor
-        if isinstance(predictor, PosePredictor):
-            predictor = predictor._replace(pose=predictor.pose + zero)
+        assert isinstance(predictor, PosePredictor)
+        predictor = predictor._replace(pose=predictor.pose + zero)
         network = model.network._replace(predictor=predictor, weights=model.network.weights + zero)
         return frame.function(dataclasses.replace(model, network=network))(latent, *others)
 
@@ -97,10 +102,9 @@ def run_litert(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     run = Interpreter(model_path=str(path), num_threads=1).get_signature_runner()
     rotations, translation = (np.asarray(x, np.float32) for x in (motion.rotations, motion.translation))
     state = frame.state_arrays(inference.initial_state(model, Pose(rotations[0], translation[0])))
-    external = [np.zeros(3, np.float32)] if "external" in frame.arguments(model) else []
     vertices = []
     for pose in zip(rotations, translation, strict=True):
-        results = run(**dict(zip(frame.arguments(model), (*state, *pose, *external), strict=True)))
+        results = run(**dict(zip(frame.arguments(model), (*state, *pose), strict=True)))
         state = [results[name] for name in frame.results(model)[: len(state)]]
         vertices.append(results["vertices"])
     return np.stack(vertices)

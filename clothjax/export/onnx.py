@@ -136,21 +136,21 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     given = {"latent": latent_shape, "history": history_shape}
     given |= {"rotations": (batch, count, 3, 3), "translation": (batch, 3)}
     following = {"next_latent": latent_shape, "next_history": history_shape, "ok": (batch,)}
-    vertices, garment, skinned, decoded, canonical_felt = wearer.template.shape[1], "", "", "", ""
+    vertices, decoded, relaxed, skinned = wearer.template.shape[1], "", "", ""
     if isinstance(predictor, ForcePredictor):
         drape = {name: (batch, *shape) for name, shape in onnx_forces.shapes(model).items()}
         given |= drape | {"external": (batch, 3)}
         following |= {f"next_{name}": shape for name, shape in drape.items()}
         felt = onnx_forces.parts(model)
         decoded = canonical(g, latent, model, felt.felt.shapes, felt.template)
-        canonical_felt, skinned = onnx_forces.follow(g, model, latent, decoded, rows, advance)
-        if predictor.felt is None:
-            garment = canonical_felt
+        relaxed, skinned = onnx_forces.follow(g, model, latent, decoded, rows, advance)
     if output == "none":
         return given, following, g
-    garment = garment or canonical(g, latent, model)
     if isinstance(predictor, ForcePredictor):
-        garment = onnx_forces.shown_apart(g, model, garment, decoded, canonical_felt)
+        apart = predictor.felt is not None
+        garment = onnx_forces.shown_apart(g, model, canonical(g, latent, model), decoded, relaxed) if apart else relaxed
+    else:
+        garment = canonical(g, latent, model)
     if output == "world":
         if not isinstance(predictor, ForcePredictor) or predictor.felt is not None:
             skinned = g.skinned(garment, transforms, network.weights)

@@ -127,10 +127,11 @@ def shown_apart(g: Graph, model: Model, garment: str, decoded: str, canonical: s
         canonical: [N, 3, V] m, the same after it, of `follow`.
     """
     it = parts(model)
-    felt, count = it.predictor.felt, len(it.cloth.mass)
-    if felt is None or it.cloth.mobility is None:
+    felt = it.predictor.felt
+    assert felt is not None
+    if it.cloth.mobility is None:
         return garment
-    moved = g("Sub", canonical, g.reshape(decoded, 3, count))
+    moved = g("Sub", canonical, g.reshape(decoded, 3, len(it.cloth.mass)))
     taken = g("Gather", moved, np.asarray(felt.around, np.int64), axis=2)  # [N, 3, V', 3]
     taken = g("ReduceSum", g("Mul", taken, np.asarray(felt.shares)), np.array([3], np.int64), keepdims=0)
     return g("Add", garment, g.reshape(taken, 3 * len(felt.around)))

@@ -11,7 +11,7 @@ from clothjax.config import Config
 from clothjax.networks import forces, psi
 from clothjax.physics import contact_search, incremental_potential, relaxation
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.runtime.models import Drape, Felt, ForcePredictor, Layer, Model, Network, Shown
+from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network, Shown
 from clothjax.types import Array, Contact, Pose
 
 HIGHEST = jax.lax.Precision.HIGHEST
@@ -33,14 +33,15 @@ def blend_weights(network: Network, latent: Array, config: Config) -> Array:
     return weights if network.mix is None else weights @ network.mix.kernel + network.mix.bias
 
 
-def shown(model: Model, latent: Array, transforms: Array) -> Array:
+def shown(model: Model, latent: Array, transforms: Array, moved: Array | float = 0.0) -> Array:
     """Return the vertices [V, 3] m of a code [C], relative to the root's translation.
 
     Args:
         transforms: [J', 3, 4] of the joints.
+        moved: [3, V] m, what is added in the canonical pose.
     """
     garment = _canonical(model, latent, Shown(model.network.shapes, model.network.weights), model.wearer.template)
-    return _skin(_rows(model.network.weights, transforms), garment).T
+    return _skin(_rows(model.network.weights, transforms), garment + moved).T
 
 
 def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, transforms: Array) -> Array:
@@ -51,20 +52,14 @@ def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, tr
         planes: of `predict`, relative to the root's translation.
     """
     felt = _forces(model).felt
-    garment = drape.position if felt is None else _shown_apart(model, latent, drape, felt, transforms)
-    nearest = slice(None) if felt is None else felt.nearest
+    if felt is None:
+        garment, nearest = drape.position, slice(None)
+    else:  # it takes part in the relaxation of the garment that feels
+        moved = drape.garment - _canonical(model, latent, *felt_garment(model))
+        taken = jnp.sum(moved[:, felt.around] * felt.shares[None], axis=-1)
+        garment, nearest = shown(model, latent, transforms, taken), felt.nearest
     offset = model.config.physics.collision_offset
     return contact_search.pushed_out(garment, planes.point_next[nearest], planes.normal_next[nearest], offset, DEEPEST)
-
-
-def _shown_apart(model: Model, latent: Array, drape: Drape, felt: Felt, transforms: Array) -> Array:
-    """Return the vertices [V', 3] m that are shown, which take part in the relaxation of those that feel."""
-    network, cloth = model.network, model.wearer.cloth
-    garment = _canonical(model, latent, Shown(network.shapes, network.weights), model.wearer.template)
-    if cloth is not None and cloth.mobility is not None:
-        moved = drape.garment - _canonical(model, latent, *felt_garment(model))
-        garment += jnp.sum(moved[:, felt.around] * felt.shares[None], axis=-1)
-    return _skin(_rows(network.weights, transforms), garment).T
 
 
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:

@@ -126,10 +126,16 @@ def test_a_garment_at_rest_can_be_left_alone(name):
         state, frozen = inference.step(model, state, poses[-1])
         assert frames < 300
     assert frames > 2
+    apart, rested = [], state
     for _ in range(300):
         state, vertices = inference.step(model, state, poses[-1])
-    apart = np.linalg.norm(vertices - frozen, axis=1)
-    assert np.quantile(apart, 0.99) < 2e-4 and apart.max() < 1e-3  # a vertex between two faces may take the other one
+        apart.append(np.linalg.norm(vertices - frozen, axis=1))
+    if state.drape is not None:
+        moved = np.linalg.norm(state.drape.position - rested.drape.position, axis=1)
+        assert moved.max() < 5e-5
+    # of all frames: a vertex between two faces that are equally near is pushed out of the one or the other
+    flickers = (np.array(apart) > 2e-4).any(axis=0)
+    assert flickers.sum() <= 3 and np.max(apart) < 1e-3
 
 
 def test_psi_does_not_see_place_or_heading(trained):
