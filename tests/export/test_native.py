@@ -445,6 +445,25 @@ def test_c_relaxes_as_the_model(forced, motion):
     np.testing.assert_allclose(drape._skin(rows, found.garment).T, found.position, atol=2e-6)
 
 
+def test_c_shows_its_part_of_the_relaxation_on_another_mesh(forced, motion, monkeypatch):
+    """Beside a garment that cannot relax, so that the rounding of both is the same; none is pushed out of the body."""
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    monkeypatch.setattr(drape, "DEEPEST", 0.0)
+    model, pose = forced["relaxed mesh"], at(motion, 3)
+    stiff = model.wearer.cloth._replace(mobility=jnp.zeros_like(model.wearer.cloth.mobility))
+    rigid = dataclasses.replace(model, wearer=model.wearer._replace(cloth=stiff))
+    state = inference.initial_state(model, at(motion, 2))
+    (relaxed, shown), (without, before) = (psi_ffi.step(psi_ffi.pack(each), state, pose) for each in (model, rigid))
+    felt = model.network.predictor.felt
+    moved = (relaxed.drape.garment - without.drape.garment)[:, felt.around]
+    taken = jnp.sum(moved * felt.shares[None], axis=-1)
+    rows = drape._rows(model.network.weights, inference._transforms(model, *kinematics(model, pose)))
+    turned = jnp.einsum("abv,bv->av", rows[:, :3], taken, precision="highest").T
+    assert jnp.linalg.norm(turned, axis=1).max() > 2e-3
+    np.testing.assert_allclose(shown - before, turned, atol=5e-6)
+
+
 LOST = """
 #include "psi.h"
 #include <math.h>
