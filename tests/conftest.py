@@ -27,6 +27,13 @@ def compiled_once(tmp_path_factory, worker_id):
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def programs_let_go():
+    """A process maps memory for each program that it keeps, and Linux ends it at 65 530 of them."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of reference data beside the repository, which not everyone has."""
