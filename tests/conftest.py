@@ -29,9 +29,11 @@ def compiled_once(tmp_path_factory, worker_id):
 
 @pytest.fixture(scope="module", autouse=True)
 def programs_let_go():
-    """A process maps memory for each program that it keeps, and Linux ends it at 65 530 of them."""
+    """A process maps memory for each program that it keeps, and Linux ends one that has 65 530 maps."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

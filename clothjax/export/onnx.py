@@ -146,19 +146,27 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         relaxed, skinned = onnx_forces.follow(g, model, latent, decoded, rows, advance)
     if output == "none":
         return given, following, g
-    if isinstance(predictor, ForcePredictor):
-        apart = predictor.felt is not None
-        garment = onnx_forces.shown_apart(g, model, canonical(g, latent, model), decoded, relaxed) if apart else relaxed
+    felt = predictor.felt if isinstance(predictor, ForcePredictor) else None
+    if isinstance(predictor, ForcePredictor) and output == "world":
+        touched = onnx_forces.outside(g, model, skinned, planes, advance)
+        placed = onnx_forces.relaxed_outside(g, model, skinned, touched)
+        if felt is not None:
+            moved = onnx_forces.carried_back(g, rows, relaxed, skinned, placed)
+            garment = onnx_forces.shown_apart(g, model, canonical(g, latent, model), decoded, moved)
+            placed, touched = g.skinned(garment, transforms, network.weights), touched.at(g, np.asarray(felt.nearest))
+        placed = onnx_forces.pushed_out(g, placed, touched)
+    elif isinstance(predictor, ForcePredictor) and felt is None:
+        placed = relaxed
+    elif isinstance(predictor, ForcePredictor):
+        placed = onnx_forces.shown_apart(g, model, canonical(g, latent, model), decoded, relaxed)
+    elif output == "world":
+        placed = g.skinned(canonical(g, latent, model), transforms, network.weights)
     else:
-        garment = canonical(g, latent, model)
+        placed = canonical(g, latent, model)
     if output == "world":
-        if not isinstance(predictor, ForcePredictor) or predictor.felt is not None:
-            skinned = g.skinned(garment, transforms, network.weights)
-        if isinstance(predictor, ForcePredictor):
-            skinned = onnx_forces.pushed_out(g, model, skinned, planes, advance)
-        placed = g("Add", skinned, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
+        placed = g("Add", placed, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
-        placed = g.reshape(garment, 3, vertices)
+        placed = g.reshape(placed, 3, vertices)
     g("Transpose", placed, perm=[0, 2, 1], name="vertices")
     return given, following | {"vertices": (batch, vertices, 3)}, g
 

@@ -110,7 +110,7 @@ def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance
     else:
         decoded = g("Reshape", garment, shape)
         skinned = moved(g, rows, decoded)
-        placed = _relaxed(g, model, skinned, np.asarray(cloth.mobility))
+        placed = _relaxed(g, model, skinned, model.config.model.relaxation)
         back = _unapplied(g, rows, g("Sub", placed, skinned))
         canonical = g("Add", decoded, back, name="next_garment")
     position = g("Transpose", placed, perm=[0, 2, 1], name="next_position")
@@ -118,13 +118,48 @@ def follow(g: Graph, model: Model, latent: str, garment: str, rows: str, advance
     return canonical, placed
 
 
+class Outside(NamedTuple):
+    """Planes that a garment is pushed out of, for each of its vertices: rows [N, 3, V] and [N, 1, V]."""
+
+    point: str
+    normal: str
+    apart: str  # how far outside of the plane the vertex is then
+
+    def at(self, g: Graph, nearest: np.ndarray) -> "Outside":
+        """Return those of some of the vertices [V']."""
+        return Outside(*(g("Gather", row, nearest.astype(np.int64), axis=2) for row in self))
+
+
+def outside(g: Graph, model: Model, position: str, planes: tuple[str, str], advance: str) -> Outside:
+    """Return what a garment is pushed out of, none of it by more than `drape.DEEPEST`.
+
+    Args:
+        position: [N, 3, V] m, of `follow`.
+        planes, advance: as of `next_code`.
+    """
+    point, normal = g("Sub", planes[0], advance), planes[1]
+    farthest = g("Add", _dot(g, g("Sub", position, point), normal), np.float32(drape.DEEPEST))
+    return Outside(point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset)))
+
+
+def relaxed_outside(g: Graph, model: Model, position: str, planes: Outside) -> str:
+    """Return the garment [N, 3, V] m that feels, pushed out and relaxed in turn, but for the last push.
+
+    Args:
+        position: [N, 3, V] m, of `follow`.
+    """
+    for _ in range(0 if parts(model).cloth.mobility is None else model.config.model.relaxation):
+        position = _relaxed(g, model, pushed_out(g, position, planes), 1)
+    return position
+
+
 def shown_apart(g: Graph, model: Model, garment: str, decoded: str, canonical: str) -> str:
-    """Return the garment [N, 3 V'] m that is shown where another feels, with its part of the relaxation of that one.
+    """Return the garment [N, 3 V'] m that is shown where another feels, moved as that one.
 
     Args:
         garment: [N, 3 V'] m, before.
-        decoded: [N, 3 V] m, the garment that feels before relaxation.
-        canonical: [N, 3, V] m, the same after it, of `follow`.
+        decoded: [N, 3 V] m, the garment that feels as it is decoded ...
+        canonical: [N, 3, V] m, ... and as it is moved.
     """
     it = parts(model)
     felt = it.predictor.felt
@@ -137,11 +172,23 @@ def shown_apart(g: Graph, model: Model, garment: str, decoded: str, canonical: s
     return g("Add", garment, g.reshape(taken, 3 * len(felt.around)))
 
 
-def _relaxed(g: Graph, model: Model, position: str, mobility: np.ndarray) -> str:
-    """Return positions [N, 3, V] m after the steps of `relaxation.relaxed`, for mobilities [V] m/N."""
+def carried_back(g: Graph, rows: str, canonical: str, position: str, later: str) -> str:
+    """Return the garment [N, 3, V] m that feels, in the canonical pose, where it has moved from one place to another.
+
+    Args:
+        rows: as of `next_code`.
+        canonical, position: [N, 3, V] m, of `follow`.
+        later: [N, 3, V] m, of `outside`.
+    """
+    return g("Add", canonical, _unapplied(g, rows, g("Sub", later, position)))
+
+
+def _relaxed(g: Graph, model: Model, position: str, steps: int) -> str:
+    """Return positions [N, 3, V] m after some of the steps of `relaxation.relaxed`."""
     it = parts(model)
+    mobility = np.asarray(it.cloth.mobility)
     faces, longest = np.asarray(it.predictor.mesh.faces), np.float32(relaxation.LONGEST**-2)
-    for _ in range(model.config.model.relaxation):
+    for _ in range(steps):
         pull = _at_vertices(g, _stretching(g, it, position, faces), [faces], len(mobility))
         move = g("Mul", pull, -mobility)
         length = g("Sqrt", g("Add", g("Mul", _dot(g, move, move), longest), np.float32(1.0)))
@@ -159,22 +206,11 @@ def _unapplied(g: Graph, rows: str, vectors: str) -> str:
     return g("Div", g("Concat", *(_dot(g, normal, vectors) for normal in normals), axis=1), safe)
 
 
-def pushed_out(g: Graph, model: Model, shown: str, planes: tuple[str, str], advance: str) -> str:
-    """Return the vertices [N, 3, V'] m that are shown, pushed out of the body as by `drape.shown_outside`.
-
-    Args:
-        shown: [N, 3, V'] m, relative to the root's new place.
-        planes: of `next_code`.
-        advance: as of `next_code`.
-    """
-    felt = parts(model).predictor.felt
-    point, normal = planes
-    if felt is not None:
-        point, normal = (g("Gather", x, np.asarray(felt.nearest, np.int64), axis=2) for x in planes)
-    gap = _dot(g, g("Sub", g("Add", shown, advance), point), normal)
-    depth = g("Sub", np.float32(model.config.physics.collision_offset), gap)
-    depth = g("Min", g("Relu", depth), np.float32(drape.DEEPEST))
-    return g("Add", shown, g("Mul", depth, normal))
+def pushed_out(g: Graph, position: str, planes: Outside) -> str:
+    """Return vertices [N, 3, V] m, pushed out of planes as by `contact_search.pushed_out`."""
+    gap = _dot(g, g("Sub", position, planes.point), planes.normal)
+    depth = g("Min", g("Relu", g("Sub", planes.apart, gap)), np.float32(drape.DEEPEST))
+    return g("Add", position, g("Mul", depth, planes.normal))
 
 
 def pushed(g: Graph) -> str:

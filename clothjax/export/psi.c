@@ -96,6 +96,7 @@ struct psi_state {
     float *patch;          /* [5][faces / PATCH], middle and radius of clusters of faces, how near one is */
     int32_t *nearest;      /* the face that is nearest */
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it was raised */
+    float *apart;          /* how far outside of it the vertices are that are shown */
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
 
@@ -1075,25 +1076,25 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;
 }
 
-/* Relaxes the garment that is posed in s->held: relaxation.relaxed, drape._hung. s->garment moves by as much, which
- * stays in the last rows of s->force. */
-static void relax(const forces *f, psi_state *s) {
+/* One step of relaxation of the garment in s->held: relaxation.relaxed. */
+static void ease(const forces *f, psi_state *s) {
     const size_t wide = padded(f->vertices);
-    float *push = s->force, *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
-    memcpy(before, s->held, 3 * wide * sizeof(float));
-    for (int32_t n = 0; n < f->relaxation; n++) {
-        float *x = s->held, *y = x + wide, *z = y + wide;
-        memset(push, 0, 3 * wide * sizeof(float));
-        push_stretching(f, s->held, push);
-        for (size_t i = 0; i < wide; i++) {
-            const float a = f->mobility[i] * push[i], b = f->mobility[i] * push[wide + i],
-                        c = f->mobility[i] * push[2 * wide + i],
-                        share = 1.0f / sqrtf(1.0f + (a * a + b * b + c * c) / (LONGEST * LONGEST));
-            x[i] += share * a, y[i] += share * b, z[i] += share * c;
-        }
-    }
+    float *push = s->force, *x = s->held, *y = x + wide, *z = y + wide;
+    memset(push, 0, 3 * wide * sizeof(float));
+    push_stretching(f, s->held, push);
     for (size_t i = 0; i < wide; i++) {
-        float column[3][3], moved[3], back[3], size = 0.0f; /* Cramer's rule, as skinning.unapply_direction */
+        const float a = f->mobility[i] * push[i], b = f->mobility[i] * push[wide + i],
+                    c = f->mobility[i] * push[2 * wide + i],
+                    share = 1.0f / sqrtf(1.0f + (a * a + b * b + c * c) / (LONGEST * LONGEST));
+        x[i] += share * a, y[i] += share * b, z[i] += share * c;
+    }
+}
+
+/* Adds to `canonical` what s->held has moved by from `before`, carried back: skinning.unapply_direction. */
+static void carry_back(const forces *f, const psi_state *s, const float *before, float *canonical) {
+    const size_t wide = padded(f->vertices);
+    for (size_t i = 0; i < wide; i++) {
+        float column[3][3], moved[3], back[3], size = 0.0f; /* Cramer's rule */
         for (int c = 0; c < 3; c++) {
             moved[c] = s->held[c * wide + i] - before[c * wide + i];
             for (int k = 0; k < 3; k++) column[k][c] = s->blended[(4 * c + k) * wide + i];
@@ -1105,8 +1106,19 @@ static void relax(const forces *f, psi_state *s) {
             if (k == 0) size = normal[0] * column[0][0] + normal[1] * column[0][1] + normal[2] * column[0][2];
         }
         size = fabsf(size) < FLAT ? (size < 0.0f ? -FLAT : FLAT) : size;
-        for (int c = 0; c < 3; c++) s->garment[c * wide + i] += canonical[c * wide + i] = back[c] / size;
+        for (int c = 0; c < 3; c++) canonical[c * wide + i] += back[c] / size;
     }
+}
+
+/* Relaxes the garment that is posed in s->held: drape._hung. What it moves by stays in the last rows of s->force. */
+static void relax(const forces *f, psi_state *s) {
+    const size_t wide = padded(f->vertices);
+    float *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
+    memcpy(before, s->held, 3 * wide * sizeof(float));
+    memset(canonical, 0, 3 * wide * sizeof(float));
+    for (int32_t n = 0; n < f->relaxation; n++) ease(f, s);
+    carry_back(f, s, before, canonical);
+    for (size_t i = 0; i < 3 * wide; i++) s->garment[i] += canonical[i];
 }
 
 /* How the garment hangs after a step; the code before it is in s->next. */
@@ -1125,7 +1137,44 @@ static void drape(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < m->code; i++) s->change[i] = s->latent[i] - s->next[i];
 }
 
-/* The garment that is shown where another feels: it takes part in the relaxation of that one. */
+/* How far the garment in s->held is from its planes; `advance` leads to it from the last root. */
+static inline float gap_of(const psi_state *s, size_t wide, size_t v, const float *advance) {
+    const float *n = s->plane + v, *x = s->held + v;
+    return n[0] * (x[0] + advance[0]) + n[wide] * (x[wide] + advance[1]) + n[2 * wide] * (x[2 * wide] + advance[2]) -
+           n[3 * wide];
+}
+
+static void push_held(const forces *f, psi_state *s, const float *advance) {
+    const size_t wide = padded(f->vertices);
+    for (int32_t v = 0; v < f->vertices; v++) {
+        const float gap = gap_of(s, wide, v, advance), depth = gap < s->apart[v] ? s->apart[v] - gap : 0.0f,
+                    push = depth < f->deepest ? depth : f->deepest;
+        for (int c = 0; c < 3; c++) s->held[c * wide + v] += push * s->plane[c * wide + v];
+    }
+}
+
+/* Pushes the garment in s->held out of the body and relaxes it, in turn: drape.shown_outside. */
+static void lift(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const size_t wide = padded(f->vertices);
+    float advance[3], *canonical = s->force + 6 * wide;
+    for (int c = 0; c < 3; c++) advance[c] = s->translation[c] - s->translation[3 + c];
+    for (int32_t v = 0; v < f->vertices; v++) {
+        const float farthest = gap_of(s, wide, v, advance) + f->deepest;
+        s->apart[v] = farthest < f->offset ? farthest : f->offset;
+    }
+    for (int32_t n = 0; n < f->relaxation; n++) {
+        push_held(f, s, advance);
+        ease(f, s);
+    }
+    if (!m->apart) {
+        push_held(f, s, advance);
+    } else if (f->relaxation) { /* what is shown takes part in it */
+        carry_back(f, s, s->position, canonical);
+    }
+}
+
+/* The garment that is shown where another feels: it takes part in how that one is relaxed. */
 static const float *decode_apart(const psi_model *m, psi_state *s) {
     const size_t count = m->vertices, rows = padded(m->vertices), wide = padded(m->f.vertices);
     const float *moved = s->force + 6 * wide;
@@ -1140,18 +1189,19 @@ static const float *decode_apart(const psi_model *m, psi_state *s) {
 static void show(const psi_model *m, const psi_state *s, float *vertices) {
     const size_t count = m->f.vertices, wide = padded(m->f.vertices);
     for (size_t v = 0; v < count; v++)
-        for (int c = 0; c < 3; c++) vertices[3 * v + c] = s->position[c * wide + v] + s->translation[c];
+        for (int c = 0; c < 3; c++) vertices[3 * v + c] = s->held[c * wide + v] + s->translation[c];
 }
 
-/* Pushes vertices [vertices][3] that are shown out of the planes that the garment touches. */
+/* Pushes vertices [vertices][3] that are shown, but do not feel, out of the planes of those that do. */
 static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
     const float *last = s->translation + 3;
     const size_t wide = padded(m->f.vertices);
     for (int32_t v = 0; v < m->vertices; v++) {
-        const float *plane = s->plane + (m->apart ? m->f.around[v] : v);
+        const float *plane = s->plane + m->f.around[v];
         float *x = vertices + 3 * v, gap = -plane[3 * wide];
         for (int c = 0; c < 3; c++) gap += plane[c * wide] * (x[c] - last[c]);
-        const float depth = gap < m->f.offset ? m->f.offset - gap : 0.0f, push = depth < m->f.deepest ? depth : m->f.deepest;
+        const float apart = s->apart[m->f.around[v]], depth = gap < apart ? apart - gap : 0.0f,
+                    push = depth < m->f.deepest ? depth : m->f.deepest;
         for (int c = 0; c < 3; c++) x[c] += push * plane[c * wide];
     }
 }
@@ -1194,12 +1244,13 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     float *swap = s->latent;
     s->latent = s->next, s->next = swap;
     if (m->forced) drape(m, s);
+    if (vertices && m->forced) lift(m, s);
     if (vertices && m->forced && !m->apart) {
         show(m, s, vertices);
     } else if (vertices) {
         skin(m, s, m->forced ? decode_apart(m, s) : decode(m, s, &m->shapes), vertices);
     }
-    if (vertices && m->forced) push_out(m, s, vertices);
+    if (vertices && m->apart) push_out(m, s, vertices);
     s->outside = (finite && s->pushed ? 0 : PSI_NOT_FINITE) | (ordinary ? 0 : PSI_POSE) | (m->known ? 0 : PSI_WEARER) |
                  (inside ? 0 : PSI_CODE);
     return s->outside == 0;
@@ -1238,6 +1289,7 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->nearest = (int32_t *)part(room, &used, vertices);
     s->plane = part(room, &used, 4 * vertices);
     s->raised = part(room, &used, vertices);
+    s->apart = part(room, &used, vertices);
     s->body = part(room, &used, 3 * (size_t)padded(m->f.body));
     s->centre = part(room, &used, 3 * (size_t)padded(m->f.faces));
     for (int k = 0; k < KINDS; k++) s->pulled[k] = part(room, &used, 2 * (size_t)m->widest);

@@ -186,12 +186,12 @@ def pushed_out(
     positions: Float[Array, "V 3"],
     points: Float[Array, "V 3"],
     normals: Float[Array, "V 3"],
-    apart: float,
+    apart: Float[Array, " V"],
     farthest: float,
 ) -> Float[Array, "V 3"]:
-    """Return positions [V, 3] m, those less than `apart` m outside their planes moved along the normals to there.
+    """Return positions [V, 3] m, those less than `apart` [V] m outside their planes moved along the normals to there.
 
-    None is moved by more than `farthest` m: what seems deeper inside is beside the body, behind a plane that ends.
+    None is moved by more than `farthest` m.
     """
     depth = jnp.clip(apart - distance(positions, points, normals), 0.0, farthest)
     return positions + depth[:, None] * normals

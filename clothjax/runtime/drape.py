@@ -18,7 +18,7 @@ HIGHEST = jax.lax.Precision.HIGHEST
 STILL = 2.5e-5  # of the rotation matrices, and in m: a pose that changes by less stands still
 AWAKE = 60  # frames that the cloth moves freely for on a body that stands still; then ...
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
-DEEPEST = 0.02  # m, by which a vertex that would be shown in the body is pushed out of it at most
+DEEPEST = 0.02  # m, by which a vertex is pushed out at most: what seems deeper is beside the body, behind a plane's end
 
 
 def blend_weights(network: Network, latent: Array, config: Config) -> Array:
@@ -45,21 +45,31 @@ def shown(model: Model, latent: Array, transforms: Array, moved: Array | float =
 
 
 def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, transforms: Array) -> Array:
-    """Return the vertices [V, 3] m of a Psi with forces, pushed to where the body pushes no more; arguments of `shown`.
+    """Return the vertices [V, 3] m of a Psi with forces, where the body pushes no more; arguments of `shown`.
+
+    The garment that feels is pushed out and relaxed, in turn: what is only pushed out is stretched. The state does not
+    know of this.
 
     Args:
         drape: after the step; what it feels is often what is shown.
         planes: of `predict`, relative to the root's translation.
     """
-    felt = _forces(model).felt
+    felt, outside = _forces(model).felt, drape.position
+    gap = contact_search.distance(outside, planes.point_next, planes.normal_next)
+    apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
+
+    def pushed_out(garment: Array, nearest: Array | slice = slice(None)) -> Array:
+        point, normal = planes.point_next[nearest], planes.normal_next[nearest]
+        return contact_search.pushed_out(garment, point, normal, apart[nearest], DEEPEST)
+
+    for _ in range(_relaxation(model)):
+        outside = _relaxed(model, pushed_out(outside), 1)
     if felt is None:
-        garment, nearest = drape.position, slice(None)
-    else:  # it takes part in the relaxation of the garment that feels
-        moved = drape.garment - _canonical(model, latent, *felt_garment(model))
-        taken = jnp.sum(moved[:, felt.around] * felt.shares[None], axis=-1)
-        garment, nearest = shown(model, latent, transforms, taken), felt.nearest
-    offset = model.config.physics.collision_offset
-    return contact_search.pushed_out(garment, planes.point_next[nearest], planes.normal_next[nearest], offset, DEEPEST)
+        return pushed_out(outside)
+    back = skinning.unapply_direction(_matrices(model, transforms), outside - drape.position)
+    moved = drape.garment + back.T - _canonical(model, latent, *felt_garment(model))
+    taken = jnp.sum(moved[:, felt.around] * felt.shares[None], axis=-1)  # what is shown takes part in it
+    return pushed_out(shown(model, latent, transforms, taken), felt.nearest)
 
 
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:
@@ -151,15 +161,30 @@ def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms:
 def _hung(model: Model, latent: Array, transforms: Array) -> tuple[Array, Array]:
     """Return the garment that feels, for a code [L]: [3, V] m in the canonical pose, and [V, 3] m posed and relaxed."""
     felt, template = felt_garment(model)
-    garment, rows = _canonical(model, latent, felt, template), _rows(felt.weights, transforms)
-    position, cloth = _skin(rows, garment).T, model.wearer.cloth
-    assert cloth is not None
-    if cloth.mobility is None:
+    garment = _canonical(model, latent, felt, template)
+    position, steps = _skin(_rows(felt.weights, transforms), garment).T, _relaxation(model)
+    if steps == 0:
         return garment, position
-    mesh, steps = _forces(model).mesh, model.config.model.relaxation
-    relaxed = relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, mesh, steps)
-    moved = skinning.unapply_direction(jnp.moveaxis(rows, 2, 0), relaxed - position)
-    return garment + moved.T, relaxed
+    relaxed = _relaxed(model, position, steps)
+    back = skinning.unapply_direction(_matrices(model, transforms), relaxed - position)
+    return garment + back.T, relaxed
+
+
+def _relaxation(model: Model) -> int:
+    """Return how many steps relax the garment that feels."""
+    return 0 if model.wearer.cloth is None or model.wearer.cloth.mobility is None else model.config.model.relaxation
+
+
+def _relaxed(model: Model, position: Array, steps: int) -> Array:
+    """Return the garment that feels [V, 3] m after some steps of relaxation."""
+    cloth = model.wearer.cloth
+    assert cloth is not None and cloth.mobility is not None
+    return relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, _forces(model).mesh, steps)
+
+
+def _matrices(model: Model, transforms: Array) -> Array:
+    """Return the transforms [V, 3, 4] of the vertices that feel, from those [J', 3, 4] of the joints."""
+    return jnp.moveaxis(_rows(felt_garment(model)[0].weights, transforms), 2, 0)
 
 
 def _forces(model: Model) -> ForcePredictor:

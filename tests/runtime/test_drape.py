@@ -9,9 +9,12 @@ import pytest
 from samples import random_force_psi, random_model
 
 import clothjax as cj
+from clothjax.body import skinning
 from clothjax.evaluation import rollouts
+from clothjax.geometry.vectors import at_corners
 from clothjax.material import configured_material
 from clothjax.networks import animators, forces, normalisation, phi
+from clothjax.physics import contact_search, energies
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import drape, inference, loading, specialise, trained
 from clothjax.simulation import assembly, characters, rollout
@@ -106,6 +109,38 @@ def test_vertices_are_its_garment_in_the_world_outside_of_what_it_feels(forced, 
     unseen, nothing = inference.step(model, before, pose(motion, 2), False)
     assert nothing is None
     np.testing.assert_allclose(unseen.latent, after.latent, atol=1e-6)
+
+
+def test_what_is_pushed_out_is_relaxed_outside_of_the_body(relaxing, motion):
+    """It has less stretching energy than where it is only pushed out, and is as far outside."""
+    model = relaxing.model()
+    state, cloth = inference.initial_state(model, pose(motion, 0)), model.wearer.cloth
+    mesh, offset = model.network.predictor.mesh, model.config.physics.collision_offset
+
+    def stretching(position):
+        corners = at_corners(position, mesh.faces)
+        rest = cloth.rest
+        terms = energies.stretching(corners, rest.inverse, rest.face_area, cloth.material.mu, cloth.material.lam)
+        return float(jnp.sum(terms))
+
+    lower = []
+    for t in range(1, 6):
+        rotations, joints = skinning.forward_kinematics(
+            pose(motion, t).rotations, model.wearer.joints, np.array(model.parents)
+        )
+        transforms = inference._transforms(model, rotations, joints)
+        advance = pose(motion, t).translation - pose(motion, t - 1).translation
+        _, planes = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
+        state, vertices = inference.step(model, state, pose(motion, t))
+        vertices -= pose(motion, t).translation[None]
+        gap = contact_search.distance(state.drape.position, planes.point_next, planes.normal_next)
+        found = contact_search.distance(vertices, planes.point_next, planes.normal_next)
+        assert jnp.sum((gap < offset) & (gap > offset - drape.DEEPEST)) > 20
+        apart = jnp.minimum(offset, gap + drape.DEEPEST)
+        push = (planes.point_next, planes.normal_next, apart, drape.DEEPEST)
+        assert jnp.all(found > apart - 1e-5)
+        lower.append(stretching(vertices) / stretching(contact_search.pushed_out(state.drape.position, *push)))
+    assert max(lower) < 0.7
 
 
 def test_an_acceleration_against_gravity_is_no_gravity(forced, motion):
