@@ -178,7 +178,7 @@ def carried_back(g: Graph, rows: str, canonical: str, position: str, later: str)
     Args:
         rows: as of `next_code`.
         canonical, position: [N, 3, V] m, of `follow`.
-        later: [N, 3, V] m, of `outside`.
+        later: [N, 3, V] m, of `relaxed_outside`.
     """
     return g("Add", canonical, _unapplied(g, rows, g("Sub", later, position)))
 
