@@ -117,7 +117,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     near = np.pad(near, ((0, 0), (0, ASKED - near.shape[1])), mode="edge")
     yield np.array(
         [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
-         predictor.felt is not None, len(edges), 0 if cloth.mobility is None else model.config.model.relaxation],
+         predictor.felt is not None, len(edges), drape.relaxation_steps(model)],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from clothjax.export import onnx_forces, sidecar
+from clothjax.export import onnx_drape, onnx_forces, sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
 from clothjax.runtime import inference, specialise
 from clothjax.runtime.models import FoldedLayer, ForcePredictor, Layer, Model, PosePredictor
 from clothjax.types import Array, Motion, Pose
 
-STATE = ("latent", "history")  # and with forces `onnx_forces.DRAPE`
+STATE = ("latent", "history")  # and with forces `onnx_drape.DRAPE`
 POSE = ("rotations", "translation")
 INPUTS = (*STATE, *POSE)  # without forces
 FOLLOWING = ("next_latent", "next_history", "ok")
@@ -82,7 +82,7 @@ def run_onnx(path: str | Path, model: Model, motion: Motion) -> np.ndarray:
     batch = run.get_inputs()[0].shape[0]
     batch = batch if isinstance(batch, int) else 1
     state = first_state(model, Pose(rotations[0, 0], translation[0, 0]), batch)
-    names = (*STATE, *onnx_forces.DRAPE)[: len(state)]
+    names = (*STATE, *onnx_drape.DRAPE)[: len(state)]
     external = {"external": np.zeros((batch, 3), np.float32)} if len(state) > len(STATE) else {}
     vertices = []
     for pose in zip(rotations, translation, strict=True):
@@ -113,7 +113,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         advance = g("Transpose", stepped, perm=[0, 2, 1])
         rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
         turned = g("Sub", g.slice(pose, 2, 0, 9 * count), g.slice(last, 2, 0, 9 * count))
-        code, planes = onnx_forces.next_code(g, model, rows, transforms, advance, turned)
+        code, planes = onnx_drape.next_code(g, model, rows, transforms, advance, turned)
         low, high = (np.asarray(x) for x in network.code_bounds[:2])
         whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)
         latent, _ = g.within(whole, low, high, name="next_latent")
@@ -136,37 +136,27 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     given = {"latent": latent_shape, "history": history_shape}
     given |= {"rotations": (batch, count, 3, 3), "translation": (batch, 3)}
     following = {"next_latent": latent_shape, "next_history": history_shape, "ok": (batch,)}
-    vertices, decoded, relaxed, skinned = wearer.template.shape[1], "", "", ""
+    vertices, hung = wearer.template.shape[1], None
     if isinstance(predictor, ForcePredictor):
-        drape = {name: (batch, *shape) for name, shape in onnx_forces.shapes(model).items()}
-        given |= drape | {"external": (batch, 3)}
-        following |= {f"next_{name}": shape for name, shape in drape.items()}
+        state = {name: (batch, *shape) for name, shape in onnx_drape.shapes(model).items()}
+        given |= state | {"external": (batch, 3)}
+        following |= {f"next_{name}": shape for name, shape in state.items()}
         felt = onnx_forces.parts(model)
         decoded = canonical(g, latent, model, felt.felt.shapes, felt.template)
-        relaxed, skinned = onnx_forces.follow(g, model, latent, decoded, rows, advance)
+        hung = onnx_drape.follow(g, model, latent, decoded, rows, advance)
     if output == "none":
         return given, following, g
-    felt = predictor.felt if isinstance(predictor, ForcePredictor) else None
-    if isinstance(predictor, ForcePredictor) and output == "world":
-        touched = onnx_forces.outside(g, model, skinned, planes, advance)
-        placed = onnx_forces.relaxed_outside(g, model, skinned, touched)
-        if felt is not None:
-            moved = onnx_forces.carried_back(g, rows, relaxed, skinned, placed)
-            garment = onnx_forces.shown_apart(g, model, canonical(g, latent, model), decoded, moved)
-            placed, touched = g.skinned(garment, transforms, network.weights), touched.at(g, np.asarray(felt.nearest))
-        placed = onnx_forces.pushed_out(g, placed, touched)
-    elif isinstance(predictor, ForcePredictor) and felt is None:
-        placed = relaxed
-    elif isinstance(predictor, ForcePredictor):
-        placed = onnx_forces.shown_apart(g, model, canonical(g, latent, model), decoded, relaxed)
-    elif output == "world":
-        placed = g.skinned(canonical(g, latent, model), transforms, network.weights)
-    else:
-        placed = canonical(g, latent, model)
+    apart = isinstance(predictor, ForcePredictor) and predictor.felt is not None
+    garment = canonical(g, latent, model) if hung is None or apart else hung.canonical
     if output == "world":
+        if hung is None:
+            placed = g.skinned(garment, transforms, network.weights)
+        else:
+            placed = onnx_drape.shown_outside(g, model, garment, hung, planes, rows, transforms, advance)
         placed = g("Add", placed, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
-        placed = g.reshape(placed, 3, vertices)
+        garment = garment if hung is None or not apart else onnx_drape.shown_apart(g, model, garment, hung)
+        placed = g.reshape(garment, 3, vertices)
     g("Transpose", placed, perm=[0, 2, 1], name="vertices")
     return given, following | {"vertices": (batch, vertices, 3)}, g
 

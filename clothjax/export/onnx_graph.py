@@ -13,6 +13,7 @@ from clothjax.runtime.specialise import smoothing_scale
 from clothjax.types import Array
 
 OPSET, IR_VERSION = 17, 8
+AXES = ([1, 2, 0], [2, 0, 1])  # of the factors of a cross product
 Value = Array | np.generic  # of a constant
 
 
@@ -116,6 +117,15 @@ class Graph:
         homogeneous = self("Pad", self.reshape(garment, 1, 3, vertices), one_more, np.float32(1.0))
         moved = self("Mul", self.reshape(rows, 3, 4, vertices), homogeneous)
         return self("ReduceSum", moved, np.array([2], np.int64), keepdims=0)
+
+    def dot(self, a: str, b: str) -> str:
+        """Return the products [N, 1, n] of rows of vectors [N, 3, n]."""
+        return self("ReduceSum", self("Mul", a, b), np.array([1], np.int64), keepdims=1)
+
+    def cross(self, a: str, b: str) -> str:
+        """Return the cross products [N, 3, n] of rows of vectors [N, 3, n]."""
+        turned = [[self("Gather", x, np.array(axes, np.int64), axis=1) for axes in AXES] for x in (a, b)]
+        return self("Sub", self("Mul", turned[0][0], turned[1][1]), self("Mul", turned[0][1], turned[1][0]))
 
     def save(self, path: Path, inputs: dict[str, tuple], outputs: dict[str, tuple], flags: tuple[str, ...] = ()):
         """Check the graph and write it.

@@ -96,7 +96,7 @@ struct psi_state {
     float *patch;          /* [5][faces / PATCH], middle and radius of clusters of faces, how near one is */
     int32_t *nearest;      /* the face that is nearest */
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it was raised */
-    float *apart;          /* how far outside of it the vertices are that are shown */
+    float *target;         /* how far outside of it a vertex is pushed to be shown */
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
 
@@ -1147,7 +1147,7 @@ static inline float gap_of(const psi_state *s, size_t wide, size_t v, const floa
 static void push_held(const forces *f, psi_state *s, const float *advance) {
     const size_t wide = padded(f->vertices);
     for (int32_t v = 0; v < f->vertices; v++) {
-        const float gap = gap_of(s, wide, v, advance), depth = gap < s->apart[v] ? s->apart[v] - gap : 0.0f,
+        const float gap = gap_of(s, wide, v, advance), depth = gap < s->target[v] ? s->target[v] - gap : 0.0f,
                     push = depth < f->deepest ? depth : f->deepest;
         for (int c = 0; c < 3; c++) s->held[c * wide + v] += push * s->plane[c * wide + v];
     }
@@ -1161,7 +1161,7 @@ static void lift(const psi_model *m, psi_state *s) {
     for (int c = 0; c < 3; c++) advance[c] = s->translation[c] - s->translation[3 + c];
     for (int32_t v = 0; v < f->vertices; v++) {
         const float farthest = gap_of(s, wide, v, advance) + f->deepest;
-        s->apart[v] = farthest < f->offset ? farthest : f->offset;
+        s->target[v] = farthest < f->offset ? farthest : f->offset;
     }
     for (int32_t n = 0; n < f->relaxation; n++) {
         push_held(f, s, advance);
@@ -1200,7 +1200,7 @@ static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
         const float *plane = s->plane + m->f.around[v];
         float *x = vertices + 3 * v, gap = -plane[3 * wide];
         for (int c = 0; c < 3; c++) gap += plane[c * wide] * (x[c] - last[c]);
-        const float apart = s->apart[m->f.around[v]], depth = gap < apart ? apart - gap : 0.0f,
+        const float target = s->target[m->f.around[v]], depth = gap < target ? target - gap : 0.0f,
                     push = depth < m->f.deepest ? depth : m->f.deepest;
         for (int c = 0; c < 3; c++) x[c] += push * plane[c * wide];
     }
@@ -1289,7 +1289,7 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->nearest = (int32_t *)part(room, &used, vertices);
     s->plane = part(room, &used, 4 * vertices);
     s->raised = part(room, &used, vertices);
-    s->apart = part(room, &used, vertices);
+    s->target = part(room, &used, vertices);
     s->body = part(room, &used, 3 * (size_t)padded(m->f.body));
     s->centre = part(room, &used, 3 * (size_t)padded(m->f.faces));
     for (int k = 0; k < KINDS; k++) s->pulled[k] = part(room, &used, 2 * (size_t)m->widest);

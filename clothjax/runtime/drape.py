@@ -62,7 +62,7 @@ def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, tr
         point, normal = planes.point_next[nearest], planes.normal_next[nearest]
         return contact_search.pushed_out(garment, point, normal, apart[nearest], DEEPEST)
 
-    for _ in range(_relaxation(model)):
+    for _ in range(relaxation_steps(model)):
         outside = _relaxed(model, pushed_out(outside), 1)
     if felt is None:
         return pushed_out(outside)
@@ -162,17 +162,12 @@ def _hung(model: Model, latent: Array, transforms: Array) -> tuple[Array, Array]
     """Return the garment that feels, for a code [L]: [3, V] m in the canonical pose, and [V, 3] m posed and relaxed."""
     felt, template = felt_garment(model)
     garment = _canonical(model, latent, felt, template)
-    position, steps = _skin(_rows(felt.weights, transforms), garment).T, _relaxation(model)
+    position, steps = _skin(_rows(felt.weights, transforms), garment).T, relaxation_steps(model)
     if steps == 0:
         return garment, position
     relaxed = _relaxed(model, position, steps)
     back = skinning.unapply_direction(_matrices(model, transforms), relaxed - position)
     return garment + back.T, relaxed
-
-
-def _relaxation(model: Model) -> int:
-    """Return how many steps relax the garment that feels."""
-    return 0 if model.wearer.cloth is None or model.wearer.cloth.mobility is None else model.config.model.relaxation
 
 
 def _relaxed(model: Model, position: Array, steps: int) -> Array:
@@ -190,6 +185,12 @@ def _matrices(model: Model, transforms: Array) -> Array:
 def _forces(model: Model) -> ForcePredictor:
     assert isinstance(model.network.predictor, ForcePredictor)
     return model.network.predictor
+
+
+def relaxation_steps(model: Model) -> int:
+    """Return how many steps relax the garment that feels."""
+    assert model.wearer.cloth is not None
+    return 0 if model.wearer.cloth.mobility is None else model.config.model.relaxation
 
 
 def felt_garment(model: Model) -> tuple[Shown, Array]:

@@ -14,7 +14,7 @@ import onnxruntime
 
 from clothjax import material
 from clothjax.config import Config
-from clothjax.export import native, onnx, onnx_forces, psi_ffi, stablehlo
+from clothjax.export import native, onnx, onnx_drape, psi_ffi, stablehlo
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import configuration, storage
 from clothjax.networks import decoder, psi
@@ -252,7 +252,7 @@ def onnx_call(path: Path, model: Model) -> Call:
     """Return a call of one frame of an exported model."""
     pose = _pose(model)
     state = onnx.first_state(model, pose)
-    names = (*onnx.STATE, *onnx_forces.DRAPE)[: len(state)]
+    names = (*onnx.STATE, *onnx_drape.DRAPE)[: len(state)]
     given = dict(zip(names, state, strict=True)) | {x: np.asarray(getattr(pose, x))[None] for x in onnx.POSE}
     return bound(path, given | ({"external": np.zeros((1, 3), np.float32)} if model.wearer.cloth else {}))
 

@@ -18,7 +18,7 @@ from toy import assert_same, small
 
 from clothjax.body import skinning
 from clothjax.commands import convert
-from clothjax.export import frame, litert, native, onnx, onnx_forces, safetensors, stablehlo
+from clothjax.export import frame, litert, native, onnx, onnx_drape, safetensors, stablehlo
 from clothjax.export.onnx_graph import session
 from clothjax.files import storage
 from clothjax.networks import forces
@@ -323,7 +323,7 @@ def test_onnx_of_forces_relaxes_many_characters_seen_and_unseen(forced, motion, 
     """Two at once; the canonical garment is the relaxed one carried back, so that an engine's skinning relaxes it."""
     model, several = forced["relaxed"], (3, 40)
     poses = [Pose(jnp.asarray(motion.rotations[t]), jnp.asarray(motion.translation[t])) for t in several]
-    names, following = (*onnx.STATE, *onnx_forces.DRAPE), ("garment", "position", "velocity")
+    names, following = (*onnx.STATE, *onnx_drape.DRAPE), ("garment", "position", "velocity")
     given = [np.concatenate(x) for x in zip(*(onnx.first_state(model, pose) for pose in poses))]
     nearby = Pose(motion.rotations[[4, 41]], motion.translation[[4, 41]])
     given = dict(zip((*names, *onnx.POSE), (*given, *nearby))) | {"external": np.zeros((2, 3), np.float32)}
@@ -348,7 +348,7 @@ def test_onnx_in_eight_bits_relaxes_in_full_precision(forced, motion, tmp_path, 
     weights = specialise.ordinary_weights(model)
     monkeypatch.setattr(specialise, "ordinary_weights", lambda _: weights)
     pose = Pose(jnp.asarray(motion.rotations[5]), jnp.asarray(motion.translation[5]))
-    names, wanted = (*onnx.STATE, *onnx_forces.DRAPE, *onnx.POSE), ("next_latent", "next_position", "next_garment")
+    names, wanted = (*onnx.STATE, *onnx_drape.DRAPE, *onnx.POSE), ("next_latent", "next_position", "next_garment")
     given = (*onnx.first_state(model, pose), *(np.asarray(x)[None] for x in pose))
     given = dict(zip(names, given)) | {"external": np.zeros((1, 3), np.float32)}
     for each in (model, stiff(model)):
@@ -383,7 +383,7 @@ def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):
     model = forced["skip"]
     run = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=2))
     first, pose = (Pose(jnp.asarray(motion.rotations[t]), jnp.asarray(motion.translation[t])) for t in (0, 1))
-    names = (*onnx.STATE, *onnx_forces.DRAPE, *onnx.POSE)
+    names = (*onnx.STATE, *onnx_drape.DRAPE, *onnx.POSE)
     given = (*onnx.first_state(model, first, 2), *(np.repeat(np.asarray(x)[None], 2, axis=0) for x in pose))
     external = np.array([[0, 0, 0], [50, 10, -30]], np.float32)
     (found,) = run.run(["vertices"], dict(zip(names, given)) | {"external": external})
@@ -397,7 +397,7 @@ def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):
 def test_onnx_of_forces_comes_to_rest_as_the_model(forced, motion, tmp_path):
     """Two characters: one has stood for 74 frames, the other for 10."""
     model, pose = forced["skip"], Pose(jnp.asarray(motion.rotations[0]), jnp.asarray(motion.translation[0]))
-    run, names = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=2)), (*onnx.STATE, *onnx_forces.DRAPE)
+    run, names = session(onnx.to_onnx(model, tmp_path / "g.onnx", batch=2)), (*onnx.STATE, *onnx_drape.DRAPE)
     given = dict(zip(names, onnx.first_state(model, pose, 2)))
     given["still"] = np.array([74, 10], np.float32)
     wanted = [f"next_{name}" for name in ("change", "still")]
@@ -419,7 +419,7 @@ def test_onnx_of_forces_comes_to_rest_as_the_model(forced, motion, tmp_path):
 def test_onnx_of_forces_forgets_what_is_not_finite(motion, tmp_path):
     model = random_force_psi(limit=1e3).model()
     run = session(onnx.to_onnx(model, tmp_path / "g.onnx"))
-    names = (*onnx.STATE, *onnx_forces.DRAPE)
+    names = (*onnx.STATE, *onnx_drape.DRAPE)
     pose = Pose(jnp.asarray(motion.rotations[0]), jnp.asarray(motion.translation[0]))
     state = onnx.first_state(model, pose)
     for t in range(1, 8):

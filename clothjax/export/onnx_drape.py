@@ -1,0 +1,234 @@
+"""The part of an ONNX graph that a Psi with forces adds: how its garment hangs, and the next code from forces on it.
+
+It follows `clothjax/runtime/drape.py`. A row of vectors is [N, 3, n], of scalars [N, 1, n], for N characters.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from clothjax.export import onnx_forces
+from clothjax.export.onnx_forces import Parts
+from clothjax.export.onnx_graph import Graph
+from clothjax.networks import forces, psi
+from clothjax.networks.forces import KINDS
+from clothjax.physics import relaxation
+from clothjax.runtime import drape
+from clothjax.runtime.models import ForcePredictor, Layer, Model
+
+DRAPE = ("change", "garment", "position", "velocity", "still")  # of the state, beside `latent` and `history`
+
+
+def shapes(model: Model) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of `DRAPE` by name, without the leading axis."""
+    vertices = len(onnx_forces.parts(model).cloth.mass)
+    sizes = ((len(model.network.first),), (3, vertices), (vertices, 3), (vertices, 3), ())
+    return dict(zip(DRAPE, sizes, strict=True))
+
+
+def next_code(
+    g: Graph, model: Model, rows: str, transforms: str, advance: str, turned: str
+) -> tuple[str, tuple[str, str]]:
+    """Return the next code [N, L], not yet clipped, with points and normals [N, 3, V] of what the garment touches.
+
+    Args:
+        rows: transforms [N, 3, 4, V] of the garment that feels, at the next frame.
+        transforms: [N, J', 12] of the joints.
+        advance: [N, 3, 1] m, the root's step.
+        turned: [N, 1, 9 J], the change of the joints' rotations.
+    """
+    it = onnx_forces.parts(model)
+    held = g("Add", onnx_forces.moved(g, rows, "garment"), advance)
+    edges = np.asarray(forces.touching_edges(it.predictor.mesh, model.config.physics))
+    planes = onnx_forces.planes(g, it, edges, held, transforms, advance)
+    kinds = [
+        onnx_forces.momentum(g, model, it, held),
+        onnx_forces.elasticity(g, model, it, held),
+        onnx_forces.contact(g, model, held, *planes),
+    ]
+    on_vertices = g("Concat", *(g("Unsqueeze", kind, np.array([1], np.int64)) for kind in kinds), axis=1)
+    rotation = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
+    carried_back = g("Mul", rotation, g("Unsqueeze", on_vertices, np.array([3], np.int64)))
+    carried_back = g("ReduceSum", carried_back, np.array([2], np.int64), keepdims=0)  # [N, kinds, 3, V]
+    flat = g.reshape(carried_back, len(KINDS), int(np.prod(it.template.shape)))
+    pulls = _pulled_back(g, model, g("MatMul", flat, np.asarray(it.felt.shapes).T))
+    return _predicted(g, model, it, pulls, _awake(g, turned, advance)), planes
+
+
+class Hung(NamedTuple):
+    """The garment that feels after a step."""
+
+    decoded: str  # [N, 3 V] m, in the canonical pose, before relaxation
+    canonical: str  # [N, 3, V] m, and after it
+    placed: str  # [N, 3, V] m, posed, relative to the root's place
+
+
+def follow(g: Graph, model: Model, latent: str, decoded: str, rows: str, advance: str) -> Hung:
+    """Name the next state of the garment that feels, and return how it hangs.
+
+    Args:
+        latent: [N, L] the next code.
+        decoded: as of `Hung`.
+        rows, advance: as of `next_code`.
+    """
+    g("Sub", latent, "latent", name="next_change")
+    shape = np.array([0, 3, len(onnx_forces.parts(model).cloth.mass)], np.int64)
+    steps = drape.relaxation_steps(model)
+    if steps == 0:
+        canonical = g("Reshape", decoded, shape, name="next_garment")
+        placed = onnx_forces.moved(g, rows, canonical)
+    else:
+        garment = g("Reshape", decoded, shape)
+        skinned = onnx_forces.moved(g, rows, garment)
+        placed = _relaxed(g, model, skinned, steps)
+        back = _unapplied(g, rows, g("Sub", placed, skinned))
+        canonical = g("Add", garment, back, name="next_garment")
+    position = g("Transpose", placed, perm=[0, 2, 1], name="next_position")
+    g("Sub", g("Add", position, g("Transpose", advance, perm=[0, 2, 1])), "position", name="next_velocity")
+    return Hung(decoded, canonical, placed)
+
+
+def shown_outside(
+    g: Graph, model: Model, garment: str, hung: Hung, planes: tuple[str, str], rows: str, transforms: str, advance: str
+) -> str:
+    """Return the vertices [N, 3, V'] m that are shown, as `drape.shown_outside` does, relative to the root's place.
+
+    Args:
+        garment: [N, 3 V'] m, that is shown, as it is decoded; not used if it is the one that feels.
+        planes: of `next_code`.
+        rows, transforms, advance: as of `next_code`.
+    """
+    felt, outside = onnx_forces.parts(model).predictor.felt, hung.placed
+    point, normal = g("Sub", planes[0], advance), planes[1]
+    farthest = g("Add", g.dot(g("Sub", outside, point), normal), np.float32(drape.DEEPEST))
+    touched = (point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset)))
+    for _ in range(drape.relaxation_steps(model)):
+        outside = _relaxed(g, model, _pushed_out(g, outside, *touched), 1)
+    if felt is None:
+        return _pushed_out(g, outside, *touched)
+    back = _unapplied(g, rows, g("Sub", outside, hung.placed))
+    garment = shown_apart(g, model, garment, hung._replace(canonical=g("Add", hung.canonical, back)))
+    touched = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in touched)
+    return _pushed_out(g, g.skinned(garment, transforms, model.network.weights), *touched)
+
+
+def shown_apart(g: Graph, model: Model, garment: str, hung: Hung) -> str:
+    """Return the garment [N, 3 V'] m that is shown where another feels, with its part of how that one has moved.
+
+    Args:
+        garment: [N, 3 V'] m, as it is decoded.
+        hung: of the other one.
+    """
+    it = onnx_forces.parts(model)
+    felt = it.predictor.felt
+    assert felt is not None
+    if drape.relaxation_steps(model) == 0:
+        return garment
+    moved = g("Sub", hung.canonical, g.reshape(hung.decoded, 3, len(it.cloth.mass)))
+    taken = g("Gather", moved, np.asarray(felt.around, np.int64), axis=2)  # [N, 3, V', 3]
+    taken = g("ReduceSum", g("Mul", taken, np.asarray(felt.shares)), np.array([3], np.int64), keepdims=0)
+    return g("Add", garment, g.reshape(taken, 3 * len(felt.around)))
+
+
+def _pushed_out(g: Graph, position: str, point: str, normal: str, apart: str) -> str:
+    """Return vertices [N, 3, V] m, pushed out of planes as by `contact_search.pushed_out`."""
+    gap = g.dot(g("Sub", position, point), normal)
+    depth = g("Min", g("Relu", g("Sub", apart, gap)), np.float32(drape.DEEPEST))
+    return g("Add", position, g("Mul", depth, normal))
+
+
+def _relaxed(g: Graph, model: Model, position: str, steps: int) -> str:
+    """Return positions [N, 3, V] m after some of the steps of `relaxation.relaxed`."""
+    it = onnx_forces.parts(model)
+    mobility = np.asarray(it.cloth.mobility)
+    faces, longest = np.asarray(it.predictor.mesh.faces), np.float32(relaxation.LONGEST**-2)
+    for _ in range(steps):
+        pull = onnx_forces.at_vertices(g, onnx_forces.stretching(g, it, position, faces), [faces], len(mobility))
+        move = g("Mul", pull, -mobility)
+        length = g("Sqrt", g("Add", g("Mul", g.dot(move, move), longest), np.float32(1.0)))
+        position = g("Add", position, g("Div", move, length))
+    return position
+
+
+def _unapplied(g: Graph, rows: str, vectors: str) -> str:
+    """Return vectors [N, 3, V] carried back by transforms [N, 3, 4, V], as by `skinning.unapply_direction`."""
+    a, b, c = (g("Squeeze", g.slice(rows, 2, k, k + 1), np.array([2], np.int64)) for k in range(3))
+    normals = [g.cross(*pair) for pair in ((b, c), (c, a), (a, b))]
+    determinant, least = g.dot(a, normals[0]), np.float32(1e-3)
+    nearest = g("Where", g("Less", determinant, np.float32(0.0)), -least, least)
+    safe = g("Where", g("Less", g("Abs", determinant), least), nearest, determinant)
+    return g("Div", g("Concat", *(g.dot(normal, vectors) for normal in normals), axis=1), safe)
+
+
+def _awake(g: Graph, turned: str, advance: str) -> str:
+    """Name the next `still` as `drape.stood` does; return the share [N, 1] that is left of a change of the code."""
+    moved = g("ReduceMax", g("Abs", turned), axes=[1, 2], keepdims=0)
+    moved = g("Max", moved, g("ReduceMax", g("Abs", advance), axes=[1, 2], keepdims=0))
+    quiet = g("Equal", g("ReduceMax", g("Abs", onnx_forces.external(g)), axes=[1], keepdims=0), np.float32(0.0))
+    quiet = g("And", g("Less", moved, np.float32(drape.STILL)), quiet)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    still = g("Where", quiet, g("Add", "still", one), zero, name="next_still")
+    share = g("Pow", np.float32(drape.SLOWING), g("Relu", g("Sub", still, np.float32(drape.AWAKE))))
+    return g("Unsqueeze", share, np.array([1], np.int64))
+
+
+def _pulled_back(g: Graph, model: Model, on_weights: str) -> str:
+    """Return forces [N, kinds, L] on whitened codes, from those [N, kinds, K] on the weights of the blend shapes."""
+    network, config = model.network, model.config.model
+    read, width = network.read, network.width
+    assert isinstance(read, Layer) and isinstance(network.predictor, ForcePredictor)
+    last = len(network.decoder) - 1
+    before = [g("Add", g("MatMul", "latent", read.kernel), read.bias)]
+    before, skip = ([before[0]], None) if len(read.bias) == width else (
+        [g.slice(before[0], 1, 0, width)], g.slice(before[0], 1, width, len(read.bias))
+    )  # fmt: skip
+    for number, layer in enumerate(network.decoder):
+        if number < last or config.blendshape_relu:
+            before.append(g("Add", g("MatMul", g("Relu", before[-1]), layer.kernel), layer.bias))
+    force = on_weights
+    if network.mix is not None:
+        force = g("MatMul", force, np.asarray(network.mix.kernel).T)
+    if config.blendshape_relu:
+        weights = before.pop()
+        force = _masked(g, force, weights if skip is None else g("Add", weights, skip))
+    of_skip = force
+    for layer in reversed(network.decoder):
+        force = _masked(g, g("MatMul", force, np.asarray(layer.kernel).T), before.pop())
+    whole = force if skip is None else g("Concat", force, of_skip, axis=2)
+    back = np.asarray(network.predictor.scales.whitening.back, np.float64)
+    return g("MatMul", whole, np.asarray(read.kernel, np.float64).T @ back)
+
+
+def _masked(g: Graph, force: str, before: str) -> str:
+    """Return forces [N, kinds, n] where a ReLU of values [N, n] lets them through."""
+    open_ = g("Cast", g("Greater", before, np.float32(0.0)), to=g.onnx.TensorProto.FLOAT)
+    return g("Mul", force, g("Unsqueeze", open_, np.array([1], np.int64)))
+
+
+def _predicted(g: Graph, model: Model, it: Parts, pulls: str, share: str) -> str:
+    """Return the next code [N, L] from the forces [N, kinds, L] on whitened codes, as `psi.next_code`.
+
+    Args:
+        share: [N, 1], that is left of its change.
+    """
+    scales, params, size = it.predictor.scales, it.predictor.params, len(model.network.first)
+    inputs = (2 + len(KINDS)) * size
+    change = g("MatMul", "change", np.asarray(scales.whitening.to))
+    seen = g("Concat", "latent", change, g.reshape(pulls, len(KINDS) * size), axis=1)
+    spread = psi.BOUND * np.asarray(scales.spread)[:inputs]
+    seen = g("Tanh", g("Div", g("Sub", seen, np.asarray(scales.middle)[:inputs]), spread))
+    seen = g("Mul", seen, np.float32(psi.BOUND))
+    constants = np.asarray(psi.scaled_inputs(scales, jnp.pad(it.cloth.constants, (inputs, 0))))[inputs:]
+
+    def reading(layer: dict) -> Layer:
+        kernel = np.asarray(layer["kernel"])
+        return Layer(kernel[:inputs], np.asarray(layer["bias"]) + constants @ kernel[inputs:])
+
+    x = g.layer(seen, reading(params["mlp"]["dense_0"]))
+    for number in range(1, len(params["mlp"])):
+        layer = params["mlp"][f"dense_{number}"]
+        x = g.layer(g("Relu", x), Layer(layer["kernel"], layer["bias"]))
+    moved_by = g("Add", g.layer(seen, reading(params["linear"])), x)
+    change = g("MatMul", moved_by, np.asarray(scales.output) * np.asarray(scales.whitening.back))
+    return g("Add", "latent", g("Mul", share, change))
