@@ -436,3 +436,14 @@ def test_a_garment_touches_itself_at_its_nearest_other_triangle():
         )[0]
         distance = np.linalg.norm(positions[vertex] - place[vertex])
         np.testing.assert_allclose(distance, np.sqrt(expected[0]), atol=2e-6)
+
+
+def test_positions_are_pushed_out_along_the_normals_by_no_more_than_they_may():
+    gap, apart = jnp.array([0.02, 0.001, -0.004, -0.05]), jnp.array([0.003, 0.003, 0.003, -0.04])
+    normal = jnp.tile(jnp.array([0.0, 0.6, 0.8]), (4, 1))
+    point = jnp.arange(12.0).reshape(4, 3)
+    across = jnp.array([[1.0, 0.0, 0.0]])
+    position = point + gap[:, None] * normal + across
+    for farthest, expected in ((0.02, [0.02, 0.003, 0.003, -0.04]), (0.005, [0.02, 0.003, 0.001, -0.045])):
+        found = contact_search.pushed_out(position, point, normal, apart, farthest)
+        np.testing.assert_allclose(found, point + jnp.array(expected)[:, None] * normal + across, atol=2e-6)
