@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import sidecar
-from clothjax.geometry.clusters import ASKED
+from clothjax.geometry.clusters import ASKED, middles
+from clothjax.geometry.proximity import even, halved
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
@@ -27,7 +28,7 @@ from clothjax.types import Array, Motion
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; ...
-FORCED = 4  # ... and of one with forces
+FORCED = 5  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -115,9 +116,12 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     faces = np.argsort(order)[np.asarray(predictor.faces)][np.asarray(predictor.clusters.points).reshape(-1)]
     near = np.asarray(predictor.clusters.positions, np.int32)
     near = np.pad(near, ((0, 0), (0, ASKED - near.shape[1])), mode="edge")
+    between = np.zeros((0, ASKED), np.int32)
+    if len(edges) > 0:
+        between = even(halved(np.asarray(middles(template.T, edges)), np.arange(len(edges)), ASKED), ASKED)
     yield np.array(
         [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
-         predictor.felt is not None, len(edges), drape.relaxation_steps(model)],
+         predictor.felt is not None, len(edges), len(between), drape.relaxation_steps(model)],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
@@ -139,6 +143,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield _padded(faces.T)
     yield near
     yield _padded(edges.T)
+    yield between
     yield _padded(predictor.body[:, order])
     yield _padded(cloth.body[order].T)
     if predictor.felt is not None:

@@ -107,13 +107,14 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     transforms = g.slice(g.reshape(moving, len(model.moving), 16), 2, 0, 12)
     slack = np.asarray(network.code_bounds.slack)
     rows = advance = ""
-    planes = ("", "")
+    touched = None
     if isinstance(predictor, ForcePredictor):
         stepped = g("Sub", g.slice(pose, 2, 9 * count, 9 * count + 3), g.slice(last, 2, 9 * count, 9 * count + 3))
         advance = g("Transpose", stepped, perm=[0, 2, 1])
         rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
         turned = g("Sub", g.slice(pose, 2, 0, 9 * count), g.slice(last, 2, 0, 9 * count))
-        code, planes = onnx_drape.next_code(g, model, rows, transforms, advance, turned)
+        shown = output == "world"
+        code, touched = onnx_drape.next_code(g, model, rows, transforms, advance, turned, shown)
         low, high = (np.asarray(x) for x in network.code_bounds[:2])
         whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)
         latent, _ = g.within(whole, low, high, name="next_latent")
@@ -149,13 +150,13 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
     apart = isinstance(predictor, ForcePredictor) and predictor.felt is not None
     garment = canonical(g, latent, model) if hung is None or apart else hung.canonical
     if output == "world":
-        if hung is None:
+        if hung is None or touched is None:
             placed = g.skinned(garment, transforms, network.weights)
         else:
-            placed = onnx_drape.shown_outside(g, model, garment, hung, planes, rows, transforms, advance)
+            placed = onnx_drape.shown_outside(g, model, garment, hung, touched, rows, transforms, advance)
         placed = g("Add", placed, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
-        garment = garment if hung is None or not apart else onnx_drape.shown_apart(g, model, garment, hung)
+        garment = onnx_drape.shown_apart(g, model, garment, hung) if hung and apart else garment
         placed = g.reshape(garment, 3, vertices)
     g("Transpose", placed, perm=[0, 2, 1], name="vertices")
     return given, following | {"vertices": (batch, vertices, 3)}, g

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import onnx_forces
-from clothjax.export.onnx_forces import Parts
+from clothjax.export.onnx_forces import Parts, Planes
 from clothjax.export.onnx_graph import Graph
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
@@ -27,25 +27,42 @@ def shapes(model: Model) -> dict[str, tuple[int, ...]]:
     return dict(zip(DRAPE, sizes, strict=True))
 
 
+class Touched(NamedTuple):
+    """Planes that the garment may touch, as of `drape.Touched`."""
+
+    vertices: Planes
+    edges: Planes | None  # None if edges do not touch, or if nothing is shown
+
+
 def next_code(
-    g: Graph, model: Model, rows: str, transforms: str, advance: str, turned: str
-) -> tuple[str, tuple[str, str]]:
-    """Return the next code [N, L], not yet clipped, with points and normals [N, 3, V] of what the garment touches.
+    g: Graph, model: Model, rows: str, transforms: str, advance: str, turned: str, shown: bool
+) -> tuple[str, Touched]:
+    """Return the next code [N, L], not yet clipped, and what the garment touches.
 
     Args:
         rows: transforms [N, 3, 4, V] of the garment that feels, at the next frame.
         transforms: [N, J', 12] of the joints.
         advance: [N, 3, 1] m, the root's step.
         turned: [N, 1, 9 J], the change of the joints' rotations.
+        shown: whether what its edges touch is needed.
     """
     it = onnx_forces.parts(model)
     held = g("Add", onnx_forces.moved(g, rows, "garment"), advance)
     edges = np.asarray(forces.touching_edges(it.predictor.mesh, model.config.physics))
-    planes = onnx_forces.planes(g, it, edges, held, transforms, advance)
+    surface, clusters = onnx_forces.surface(g, it, transforms, advance), it.predictor.clusters
+    among = onnx_forces.searched(g, clusters, held, surface[0])
+    planes, at_edges = onnx_forces.nearest_planes(g, among, held, np.asarray(clusters.positions), surface), None
+    if shown and len(edges) > 0:
+        middles = _middles(g, held, edges)
+        point, normal = onnx_forces.nearest_planes(g, among, middles, np.asarray(clusters.edges), surface)
+        apart = g("Sub", middles, point)
+        far = g("Greater", g.dot(apart, apart), np.float32(drape.REACH**2))
+        far = g("Mul", g("Cast", far, to=g.onnx.TensorProto.FLOAT), np.float32(drape.SUNK))
+        at_edges = g("Sub", point, g("Mul", far, normal)), normal
     kinds = [
         onnx_forces.momentum(g, model, it, held),
         onnx_forces.elasticity(g, model, it, held),
-        onnx_forces.contact(g, model, held, *planes),
+        onnx_forces.contact(g, model, held, *onnx_forces.raised(g, it, planes, held, edges)),
     ]
     on_vertices = g("Concat", *(g("Unsqueeze", kind, np.array([1], np.int64)) for kind in kinds), axis=1)
     rotation = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
@@ -53,7 +70,7 @@ def next_code(
     carried_back = g("ReduceSum", carried_back, np.array([2], np.int64), keepdims=0)  # [N, kinds, 3, V]
     flat = g.reshape(carried_back, len(KINDS), int(np.prod(it.template.shape)))
     pulls = _pulled_back(g, model, g("MatMul", flat, np.asarray(it.felt.shapes).T))
-    return _predicted(g, model, it, pulls, _awake(g, turned, advance)), planes
+    return _predicted(g, model, it, pulls, _awake(g, turned, advance)), Touched(planes, at_edges)
 
 
 class Hung(NamedTuple):
@@ -90,27 +107,40 @@ def follow(g: Graph, model: Model, latent: str, decoded: str, rows: str, advance
 
 
 def shown_outside(
-    g: Graph, model: Model, garment: str, hung: Hung, planes: tuple[str, str], rows: str, transforms: str, advance: str
+    g: Graph, model: Model, garment: str, hung: Hung, touched: Touched, rows: str, transforms: str, advance: str
 ) -> str:
     """Return the vertices [N, 3, V'] m that are shown, as `drape.shown_outside` does, relative to the root's place.
 
     Args:
         garment: [N, 3 V'] m, that is shown, as it is decoded; not used if it is the one that feels.
-        planes: of `next_code`.
+        touched: of `next_code`.
         rows, transforms, advance: as of `next_code`.
     """
-    felt, outside = onnx_forces.parts(model).predictor.felt, hung.placed
-    point, normal = g("Sub", planes[0], advance), planes[1]
-    farthest = g("Add", g.dot(g("Sub", outside, point), normal), np.float32(drape.DEEPEST))
-    touched = (point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset)))
+    predictor, outside = onnx_forces.parts(model).predictor, hung.placed
+    felt, edges = predictor.felt, np.asarray(predictor.mesh.edges)
+
+    def targets(positions: str, planes: Planes) -> tuple[str, str, str]:
+        point, normal = g("Sub", planes[0], advance), planes[1]
+        farthest = g("Add", g.dot(g("Sub", positions, point), normal), np.float32(drape.DEEPEST))
+        return point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset))
+
+    of_vertices = targets(outside, touched.vertices)
+    of_edges = None if touched.edges is None else targets(_middles(g, outside, edges), touched.edges)
+
+    def pushed_out(garment: str) -> str:
+        if of_edges is not None:
+            garment = _edges_pushed_out(g, model, garment, edges, *of_edges)
+        return _pushed_out(g, garment, *of_vertices)
+
     for _ in range(drape.relaxation_steps(model)):
-        outside = _relaxed(g, model, _pushed_out(g, outside, *touched), 1)
+        outside = _relaxed(g, model, pushed_out(outside), 1)
+    outside = pushed_out(outside)
     if felt is None:
-        return _pushed_out(g, outside, *touched)
+        return outside
     back = _unapplied(g, rows, g("Sub", outside, hung.placed))
     garment = shown_apart(g, model, garment, hung._replace(canonical=g("Add", hung.canonical, back)))
-    touched = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in touched)
-    return _pushed_out(g, g.skinned(garment, transforms, model.network.weights), *touched)
+    near = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in of_vertices)
+    return _pushed_out(g, g.skinned(garment, transforms, model.network.weights), *near)
 
 
 def shown_apart(g: Graph, model: Model, garment: str, hung: Hung) -> str:
@@ -123,8 +153,6 @@ def shown_apart(g: Graph, model: Model, garment: str, hung: Hung) -> str:
     it = onnx_forces.parts(model)
     felt = it.predictor.felt
     assert felt is not None
-    if drape.relaxation_steps(model) == 0:
-        return garment
     moved = g("Sub", hung.canonical, g.reshape(hung.decoded, 3, len(it.cloth.mass)))
     taken = g("Gather", moved, np.asarray(felt.around, np.int64), axis=2)  # [N, 3, V', 3]
     taken = g("ReduceSum", g("Mul", taken, np.asarray(felt.shares)), np.array([3], np.int64), keepdims=0)
@@ -133,9 +161,31 @@ def shown_apart(g: Graph, model: Model, garment: str, hung: Hung) -> str:
 
 def _pushed_out(g: Graph, position: str, point: str, normal: str, apart: str) -> str:
     """Return vertices [N, 3, V] m, pushed out of planes as by `contact_search.pushed_out`."""
+    return g("Add", position, g("Mul", _depth(g, position, point, normal, apart), normal))
+
+
+def _edges_pushed_out(
+    g: Graph, model: Model, position: str, edges: np.ndarray, point: str, normal: str, apart: str
+) -> str:
+    """Return vertices [N, 3, V] m, the ends of edges moved as by `contact_search.edges_pushed_out`."""
+    depth = _depth(g, _middles(g, position, edges), point, normal, apart)
+    pushes = g("Cast", g("Greater", depth, np.float32(0.0)), to=g.onnx.TensorProto.FLOAT)
+    rows = g("Concat", g("Mul", depth, normal), pushes, axis=1)
+    total = onnx_forces.at_vertices(g, [rows, rows], [edges], len(onnx_forces.parts(model).cloth.mass))
+    mean = g("Div", g.slice(total, 1, 0, 3), g("Max", g.slice(total, 1, 3, 4), np.float32(1.0)))
+    return g("Add", position, mean)
+
+
+def _depth(g: Graph, position: str, point: str, normal: str, apart: str) -> str:
+    """Return how far positions [N, 3, n] m are to be pushed out of planes, [N, 1, n] m."""
     gap = g.dot(g("Sub", position, point), normal)
-    depth = g("Min", g("Relu", g("Sub", apart, gap)), np.float32(drape.DEEPEST))
-    return g("Add", position, g("Mul", depth, normal))
+    return g("Min", g("Relu", g("Sub", apart, gap)), np.float32(drape.DEEPEST))
+
+
+def _middles(g: Graph, positions: str, edges: np.ndarray) -> str:
+    """Return the middles [N, 3, E] m of edges [E, 2] of positions [N, 3, V] m."""
+    start, end = (g("Gather", positions, edges[:, k], axis=2) for k in range(2))
+    return g("Mul", g("Add", start, end), np.float32(0.5))
 
 
 def _relaxed(g: Graph, model: Model, position: str, steps: int) -> str:

@@ -14,6 +14,8 @@ from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Model, Shown
 
+Planes = tuple[str, str]  # points and normals [N, 3, n]
+
 
 class Parts(NamedTuple):
     """What a model with forces has, checked to be there."""
@@ -79,12 +81,17 @@ def elasticity(g: Graph, model: Model, it: Parts, held: str) -> str:
     return g("Neg", at_vertices(g, gradients, [faces, hinges], it.template.shape[1]))
 
 
-def at_vertices(g: Graph, gradients: list[str], elements: list[np.ndarray], vertices: int) -> str:
-    """Sum the gradients [N, 3, n] for the corners of elements, in the order of `_around`, to those [N, 3, V]."""
+def at_vertices(g: Graph, values: list[str], elements: list[np.ndarray], vertices: int) -> str:
+    """Sum values [N, R, n] for the corners of elements, in the order of `_around`, to those [N, R, V] of vertices."""
+    return g("ReduceSum", _at_vertices(g, values, elements, vertices), np.array([3], np.int64), keepdims=0)
+
+
+def _at_vertices(g: Graph, values: list[str], elements: list[np.ndarray], vertices: int) -> str:
+    """Gather values [N, R, n] to [N, R, V, D], zero where a vertex has fewer corners than D."""
     table = _around(elements, vertices)
-    rows = g("Pad", g("Concat", *gradients, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
-    gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 3, *table.shape)
-    return g("ReduceSum", gathered, np.array([3], np.int64), keepdims=0)
+    rows = g("Pad", g("Concat", *values, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
+    gathered = g("Gather", rows, table.reshape(-1), axis=2)
+    return g("Reshape", gathered, np.array([0, 0, *table.shape], np.int64))
 
 
 def _around(elements: list[np.ndarray], vertices: int) -> np.ndarray:
@@ -152,43 +159,37 @@ def _bending(g: Graph, model: Model, it: Parts, held: str, hinges: np.ndarray) -
     return [g("Sub", at_start, longer), g("Add", at_end, longer), *tips]
 
 
-def planes(g: Graph, it: Parts, edges: np.ndarray, held: str, transforms: str, advance: str) -> tuple[str, str]:
-    """Points and normals [N, 3, V] of the nearest faces, raised, as of `forces.felt`."""
-    predictor, cloth = it.predictor, it.cloth
-    vertices = it.template.shape[1]
+def surface(g: Graph, it: Parts, transforms: str, advance: str) -> Planes:
+    """Centroids and normals [N, 3, 16 P] of the body's faces, in the order of their clusters."""
+    predictor = it.predictor
     rows = blended(g, transforms, np.asarray(predictor.body))
-    body = g("Add", moved(g, rows, g.constant(np.asarray(cloth.body).T[None])), advance)
+    body = g("Add", moved(g, rows, g.constant(np.asarray(it.cloth.body).T[None])), advance)
     faces = np.asarray(predictor.faces)[np.asarray(predictor.clusters.points).reshape(-1)]
     corners = [g("Gather", body, faces[:, k], axis=2) for k in range(3)]
     centres = g("Mul", g("Add", g("Add", corners[0], corners[1]), corners[2]), np.float32(1.0 / 3.0))
     normals = g.cross(*(g("Sub", corner, corners[0]) for corner in corners[1:]))
     length = g("Sqrt", g("Max", g.dot(normals, normals), np.float32(1e-30)))
-    normals = g("Div", normals, length)
-    face = g.reshape(_nearest(g, predictor.clusters, held, centres), 1, vertices)
-    face = g("Concat", face, face, face, axis=1)
-    point, normal = (g("GatherElements", x, face, axis=2) for x in (centres, normals))
-    if len(edges) == 0:
-        return point, normal
-    turned, along = (g("Sub", *(g("Gather", x, edges[:, k], axis=2) for k in range(2))) for x in (normal, held))
-    bulge = g("Mul", g.dot(turned, along), np.float32(1 / 8))
-    bulge = g("Min", g("Relu", bulge), np.float32(forces.HIGHEST))
-    table = _around([edges], vertices)
-    rows = g("Pad", g("Concat", bulge, bulge, axis=2), np.array([0, 0, 0, 0, 0, 1], np.int64))
-    gathered = g.reshape(g("Gather", rows, table.reshape(-1), axis=2), 1, *table.shape)
-    raised = g("ReduceMax", gathered, axes=[3], keepdims=0)
-    return g("Add", point, g("Mul", raised, normal)), normal
+    return centres, g("Div", normals, length)
 
 
-def _nearest(g: Graph, clusters: Clusters, held: str, centres: str) -> str:
-    """Places [N, V] of the nearest of the points [N, 3, 16 P], as of `clusters.nearest_in_clusters`.
+class Searched(NamedTuple):
+    """The faces among which those nearest to clusters of vertices are searched for."""
+
+    middle: str  # [N, 3, G, 1] m, of a cluster of vertices
+    beside: str  # [N, 3, G, 16 T] m, the centroids of faces that may be near it, from its middle, and ...
+    places: str  # [N, G, 16 T] ... where they are
+
+
+def searched(g: Graph, clusters: Clusters, held: str, centres: str) -> Searched:
+    """Find the clusters of faces in which `clusters.nearest_in_clusters` searches.
 
     Args:
-        centres: the points in the order of their clusters.
+        centres: of `surface`.
     """
     asked, (count, size) = np.asarray(clusters.positions), np.shape(clusters.points)
     groups, tried = len(asked), min(TRIED, count)
     near = g.reshape(g("Gather", held, asked.reshape(-1), axis=2), 3, *asked.shape)
-    middle = g("ReduceMean", near, axes=[3], keepdims=1)  # [N, 3, G, 1]
+    middle = g("ReduceMean", near, axes=[3], keepdims=1)
     patches = g.reshape(centres, 3, count, size)
     means = g("ReduceMean", patches, axes=[3], keepdims=1)
     radius = g("ReduceSumSquare", g("Sub", patches, means), axes=[1], keepdims=1)
@@ -198,17 +199,45 @@ def _nearest(g: Graph, clusters: Clusters, held: str, centres: str) -> str:
     chosen = g("Mul", g.reshape(g.lowest(bound, tried), groups, tried, 1), np.int64(size))
     places = g.reshape(g("Add", chosen, np.arange(size)), 1, groups * tried * size)
     beside = g("GatherElements", centres, g("Concat", places, places, places, axis=1), axis=2)
-    # half the squared distance without the part of the position, from the middle: far from it products cancel
     beside = g("Sub", g.reshape(beside, 3, groups, tried * size), middle)
-    half = g("Mul", g("ReduceSumSquare", beside, axes=[1], keepdims=0), np.float32(0.5))
-    near = g("Transpose", g("Sub", near, middle), perm=[0, 2, 3, 1])
-    product = g("MatMul", near, g("Transpose", beside, perm=[0, 2, 1, 3]))  # [N, G, S, tried size]
+    return Searched(middle, beside, g.reshape(places, groups, tried * size))
+
+
+def nearest_planes(g: Graph, among: Searched, positions: str, members: np.ndarray, surface: Planes) -> Planes:
+    """Return the planes of the faces nearest to positions [N, 3, n].
+
+    Args:
+        members: [G, S], the positions for which a cluster's faces are searched; -1 is none.
+        surface: of `surface`.
+    """
+    count = members.max() + 1
+    near = g.reshape(g("Gather", positions, np.maximum(members, 0).reshape(-1), axis=2), 3, *members.shape)
+    near = g("Transpose", g("Sub", near, among.middle), perm=[0, 2, 3, 1])
+    # half the squared distance without the part of the position, from the middle: far from it products cancel
+    half = g("Mul", g("ReduceSumSquare", among.beside, axes=[1], keepdims=0), np.float32(0.5))
+    product = g("MatMul", near, g("Transpose", among.beside, perm=[0, 2, 1, 3]))  # [N, G, S, 16 T]
     score = g("Sub", g("Unsqueeze", half, np.array([2], np.int64)), product)
     best = g("ArgMin", score, axis=3, keepdims=0)  # [N, G, S]
-    found = g("GatherElements", g.reshape(places, groups, tried * size), best, axis=2)
-    order = np.zeros(asked.max() + 1, np.int64)
-    order[asked.reshape(-1)] = np.arange(asked.size)
-    return g("Gather", g.reshape(found, asked.size), order, axis=1)
+    found = g.reshape(g("GatherElements", among.places, best, axis=2), members.size)
+    order = np.zeros(count + 1, np.int64)
+    order[members.reshape(-1)] = np.arange(members.size)  # of -1 at the end
+    face = g.reshape(g("Gather", found, order[:count], axis=1), 1, count)
+    face = g("Concat", face, face, face, axis=1)
+    point, normal = (g("GatherElements", x, face, axis=2) for x in surface)
+    return point, normal
+
+
+def raised(g: Graph, it: Parts, planes: Planes, held: str, edges: np.ndarray) -> Planes:
+    """Return planes raised as by `forces.raised`."""
+    if len(edges) == 0:
+        return planes
+    point, normal = planes
+    turned, along = (g("Sub", *(g("Gather", x, edges[:, k], axis=2) for k in range(2))) for x in (normal, held))
+    bulge = g("Mul", g.dot(turned, along), np.float32(1 / 8))
+    bulge = g("Min", g("Relu", bulge), np.float32(forces.HIGHEST))
+    of_ends = _at_vertices(g, [bulge, bulge], [edges], it.template.shape[1])
+    height = g("ReduceMax", of_ends, axes=[3], keepdims=0)
+    return g("Add", point, g("Mul", height, normal)), normal
 
 
 def contact(g: Graph, model: Model, held: str, point: str, normal: str) -> str:

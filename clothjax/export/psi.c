@@ -20,8 +20,8 @@
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
 #define NEIGHBOURS 8      /* vertices of a cluster */
 #define PATCH 16          /* faces of the body in one */
-#define TRIED 24          /* clusters of faces that are searched for a cluster of vertices */
-#define PLACES 512        /* a power of two, not less than the faces in those */
+#define REACH 0.05f        /* m, farther from the middle of an edge a face does not touch it */
+#define PLACES 512        /* a power of two: faces that are compared before it is noted which are nearest */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
@@ -46,7 +46,7 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 } exact;
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
-    int32_t vertices, triangles, hinges, body, faces, clusters, edges, relaxation;
+    int32_t vertices, triangles, hinges, body, faces, clusters, edges, edge_clusters, relaxation;
     float timestep, gravity;
     float stiffness, offset, highest, deepest;        /* of planes that are touched: in N/m; m; raised, pushed at most */
     const float *mass;                                /* [vertices] */
@@ -54,7 +54,8 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
     const float *mobility;                            /* [vertices] m/N, in a step of relaxation */
     const float *bend, *angle;                        /* [hinges] */
-    const int32_t *face, *cluster, *edge;             /* [3][faces], by PATCH; [clusters][NEIGHBOURS]; [2][edges] */
+    const int32_t *face, *edge;                       /* [3][faces], by PATCH; [2][edges] */
+    const int32_t *cluster, *edge_cluster;            /* [clusters][NEIGHBOURS] vertices, [edge_clusters] ... edges */
     const float *body_weight, *body_rest;             /* [moving][body], [3][body] */
     const float *weight;                              /* [moving][vertices] */
     const int32_t *around;                            /* [3][vertices that are shown], those that feel, nearest first */
@@ -93,10 +94,15 @@ struct psi_state {
     float still; /* frames for which the body has stood still and nothing has pushed */
     float *change, *garment, *position, *velocity; /* of the code; the garment, canonical, in the world, its motion */
     float *held, *blended, *force, *body, *centre; /* [3], [12], [KINDS][3]; of the body [3][body], [3][faces] */
-    float *patch;          /* [5][faces / PATCH], middle and radius of clusters of faces, how near one is */
+    float *patch;          /* [4][faces / PATCH], middle and radius of clusters of faces */
+    int8_t *near;          /* [faces / PATCH] whether one may hold what is nearest */
     int32_t *nearest;      /* the face that is nearest */
-    float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it was raised */
+    float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it feels raised */
     float *target;         /* how far outside of it a vertex is pushed to be shown */
+    /* rows [edges, to a multiple of LANES] */
+    float *between;        /* [3], the middles of edges */
+    int32_t *nearest_between;
+    float *plane_between, *target_between;
     float *pulled[KINDS], *read[MOST_HIDDEN + 1];  /* gradients of weights and codes; what layers of the decoder give */
 };
 
@@ -228,7 +234,7 @@ static exact read_exact(reader *r, psi_model *m) {
 
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
-    const int32_t *head = integers(r, 9);
+    const int32_t *head = integers(r, 10);
     const float *rates = floats(r, 6);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
@@ -240,7 +246,8 @@ static void read_forces(reader *r, psi_model *m) {
     if (f->faces % PATCH) r->sound = 0;
     m->apart = head[6];
     f->edges = within(r, head[7], 0, MOST_ELEMENTS);
-    f->relaxation = within(r, head[8], 0, MOST_STEPS);
+    f->edge_clusters = within(r, head[8], 0, MOST_ELEMENTS / NEIGHBOURS);
+    f->relaxation = within(r, head[9], 0, MOST_STEPS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
     f->highest = rates[4], f->deepest = rates[5];
     f->mass = floats(r, padded(f->vertices));
@@ -255,6 +262,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->face = indices(r, 3 * padded(f->faces), f->body);
     f->cluster = indices(r, NEIGHBOURS * f->clusters, f->vertices);
     f->edge = indices(r, 2 * padded(f->edges), f->vertices);
+    f->edge_cluster = indices(r, NEIGHBOURS * f->edge_clusters, f->edges);
     f->body_weight = floats(r, (size_t)m->moving * padded(f->body));
     f->body_rest = floats(r, 3 * (size_t)padded(f->body));
     f->weight = m->apart ? floats(r, (size_t)m->moving * padded(f->vertices)) : m->weight;
@@ -319,10 +327,10 @@ static psi_model *failed(psi_model *m, const char **error, const char *why) {
 }
 
 static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char **error) {
-    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 4 */
+    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 5 */
     int32_t version[2] = {0, 0};
     if (size >= ALIGN) memcpy(version, bytes, sizeof version);
-    if (version[0] != name || (version[1] != 1 && version[1] != 4)) return failed(m, error, "not a .psi of this version");
+    if (version[0] != name || (version[1] != 1 && version[1] != 5)) return failed(m, error, "not a .psi of this version");
     reader r = {bytes, size, 1};
     read_model(&r, m);
     if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
@@ -691,11 +699,11 @@ static void push_momentum(const psi_model *m, psi_state *s, float *restrict forc
     }
 }
 
-/* Middles and radii of the clusters of faces, [3][row] and [row]; returns the largest radius. */
-static float find_patches(const psi_model *m, const psi_state *s, size_t row, float *restrict middle) {
-    const int32_t faces = padded(m->f.faces);
-    float *restrict radius = middle + 3 * row, most = 0.0f;
-    for (int32_t p = 0; p < m->f.faces / PATCH; p++) {
+/* Middles and radii of the clusters of faces. */
+static void find_patches(const psi_model *m, psi_state *s) {
+    const int32_t faces = padded(m->f.faces), patches = m->f.faces / PATCH, row = padded(patches);
+    float *restrict middle = s->patch, *restrict radius = middle + 3 * row;
+    for (int32_t p = 0; p < patches; p++) {
         const float *centre = s->centre + p * PATCH;
         float apart[PATCH] = {0}, farthest = 0.0f;
         for (int c = 0; c < 3; c++) {
@@ -709,19 +717,7 @@ static float find_patches(const psi_model *m, const psi_state *s, size_t row, fl
         }
         for (int i = 0; i < PATCH; i++) farthest = apart[i] > farthest ? apart[i] : farthest;
         radius[p] = sqrtf(farthest);
-        most = radius[p] > most ? radius[p] : most;
     }
-    return most;
-}
-
-/* By how much the least key that is above the last is above it, less one; none if that does not fit in 31 bits. */
-static uint32_t following(const int32_t *key, int32_t count, int32_t last) {
-    uint32_t least = UINT32_MAX;
-    for (int32_t i = 0; i < count; i++) {
-        const uint32_t beyond = (uint32_t)key[i] - (uint32_t)last - 1; /* those below come out as the largest */
-        least = beyond < least ? beyond : least;
-    }
-    return least;
 }
 
 /* Compares positions [3][NEIGHBOURS] with the faces of a cluster. The last bits of the least squared distances hold
@@ -742,64 +738,102 @@ static void compare(const float *restrict x, const float *restrict centre, size_
     }
 }
 
-/* Finds the faces whose centres are nearest to the vertices of the held garment, as clusters.nearest_in_clusters. */
-static void find_nearest(const psi_model *m, psi_state *s) {
+/* Middles of the edges of the garment in s->held. */
+static void find_middles(const forces *f, psi_state *s) {
+    const size_t wide = padded(f->vertices), edges = padded(f->edges);
+    for (int c = 0; c < 3; c++) {
+        const float *x = s->held + c * wide;
+        for (size_t e = 0; e < edges; e++) s->between[c * edges + e] = 0.5f * (x[f->edge[e]] + x[f->edge[edges + e]]);
+    }
+}
+
+/* Takes over which faces are nearest, of the clusters that were compared. */
+static void settle_faces(int32_t *least, const int32_t *chosen, int32_t *face) {
+    for (int i = 0; i < NEIGHBOURS; i++) {
+        const int32_t place = least[i] & (PLACES - 1);
+        if (place >= PATCH) face[i] = chosen[place / PATCH] * PATCH + place % PATCH;
+        least[i] -= place;
+    }
+}
+
+/* Finds the faces whose centres are nearest to the positions of a cluster, rows [3][wide] at `asked`, among those that
+   are not farther than `reach`; without one they stay as they are. The distance to the centres of faces `seen` bounds
+   the search. Which they are does not change what is found. */
+static void find_faces(const psi_model *m, const psi_state *s, const float *rows, size_t wide, const int32_t *asked,
+                       const int32_t *seen, float reach, int32_t *face) {
+    const int32_t faces = padded(m->f.faces), patches = m->f.faces / PATCH, row = padded(patches);
+    const float *restrict middle = s->patch, *restrict radius = middle + 3 * row;
+    const float most = reach * reach;
+    int8_t *restrict near = s->near;
+    float x[3][NEIGHBOURS], mean[3] = {0}, span = 0.0f, farthest = 0.0f;
+    int32_t least[NEIGHBOURS], chosen[PLACES / PATCH], count = 1; /* a place before PATCH: found before these were */
+    memcpy(least, &most, sizeof least[0]);
+    for (int i = 0; i < NEIGHBOURS; i++) least[i] = least[0] & ~(PLACES - 1);
+    for (int c = 0; c < 3; c++)
+        for (int i = 0; i < NEIGHBOURS; i++) mean[c] += (x[c][i] = rows[c * wide + asked[i]]) / NEIGHBOURS;
+    for (int i = 0; i < NEIGHBOURS; i++) {
+        float apart = 0.0f, square = 0.0f;
+        for (int c = 0; c < 3; c++) {
+            const float a = x[c][i] - mean[c], b = x[c][i] - s->centre[c * faces + seen[i]];
+            apart += a * a, square += b * b;
+        }
+        span = apart > span ? apart : span;
+        farthest = square > farthest ? square : farthest;
+    }
+    farthest = sqrtf(farthest < most ? farthest : most);
+    const float within = (sqrtf(span) + farthest) * 1.001f; /* for rounding, and the last bits of distances */
+    for (int32_t p = 0; p < patches; p++) {
+        const float a = middle[p] - mean[0], b = middle[row + p] - mean[1], c = middle[2 * row + p] - mean[2];
+        const float bound = radius[p] + within;
+        near[p] = a * a + b * b + c * c <= bound * bound;
+    }
+    for (int32_t first = 0; first < patches; first += 8) {
+        int64_t any;
+        memcpy(&any, near + first, sizeof any);
+        for (int32_t p = first; any && p < first + 8; p++) {
+            if (!near[p]) continue;
+            compare(x[0], s->centre + p * PATCH, faces, count * PATCH, least);
+            chosen[count++] = p;
+            if (count < PLACES / PATCH) continue;
+            settle_faces(least, chosen, face);
+            count = 1;
+        }
+    }
+    settle_faces(least, chosen, face);
+}
+
+/* The same for all vertices of the held garment and, if it is shown, for the middles of its edges. */
+static void find_nearest(const psi_model *m, psi_state *s, int32_t edge_clusters) {
     const forces *f = &m->f;
-    const int32_t wide = padded(f->vertices), faces = padded(f->faces), patches = f->faces / PATCH;
-    const size_t row = padded(patches);
-    const float *middle = s->patch, *radius = middle + 3 * row, most = find_patches(m, s, row, s->patch);
-    int32_t bits = 1, *restrict key = (int32_t *)(s->patch + 4 * row);
-    while (bits < patches) bits *= 2;
-    bits -= 1; /* the last bits of a key hold its cluster, the others how near that may be */
+    const size_t wide = padded(f->vertices), edges = padded(f->edges);
+    find_patches(m, s);
     for (int32_t g = 0; g < f->clusters; g++) {
-        const int32_t *vertex = f->cluster + g * NEIGHBOURS;
-        float x[3][NEIGHBOURS], mean[3] = {0}, span = 0.0f;
-        int32_t least[NEIGHBOURS], chosen[TRIED] = {0}, last = -1;
-        for (int c = 0; c < 3; c++)
-            for (int i = 0; i < NEIGHBOURS; i++) mean[c] += (x[c][i] = s->held[c * wide + vertex[i]]) / NEIGHBOURS;
+        const int32_t *asked = f->cluster + g * NEIGHBOURS;
+        int32_t face[NEIGHBOURS];
+        for (int i = 0; i < NEIGHBOURS; i++) face[i] = s->nearest[asked[i]];
+        find_faces(m, s, s->held, wide, asked, face, FARTHEST, face);
+        for (int i = 0; i < NEIGHBOURS; i++) s->nearest[asked[i]] = face[i];
+    }
+    for (int32_t g = 0; g < edge_clusters; g++) {
+        const int32_t *asked = f->edge_cluster + g * NEIGHBOURS;
+        int32_t face[NEIGHBOURS], seen[NEIGHBOURS];
+        for (int i = 0; i < NEIGHBOURS; i++) face[i] = -1, seen[i] = s->nearest[f->edge[asked[i]]];
+        find_faces(m, s, s->between, edges, asked, seen, REACH, face);
         for (int i = 0; i < NEIGHBOURS; i++) {
-            const float a = x[0][i] - mean[0], b = x[1][i] - mean[1], c = x[2][i] - mean[2];
-            least[i] = INT32_MAX & ~(PLACES - 1); /* the first face, where nothing is finite */
-            span = a * a + b * b + c * c > span ? a * a + b * b + c * c : span;
-        }
-        span = sqrtf(span);
-        for (int32_t p = 0; p < patches; p++) {
-            const float a = middle[p] - mean[0], b = middle[row + p] - mean[1], c = middle[2 * row + p] - mean[2];
-            const float square = a * a + b * b + c * c + FLT_MIN, bound = square * inverse_root(square) + (most - radius[p]);
-            int32_t whole;
-            memcpy(&whole, &bound, sizeof whole);
-            key[p] = (whole & ~bits) | p;
-        }
-        for (int k = 0; k < TRIED; k++) {
-            const uint32_t beyond = following(key, patches, last);
-            if (beyond > INT32_MAX) break;
-            last += 1 + (int32_t)beyond;
-            const int32_t whole = last & ~bits, p = last & bits;
-            float bound, farthest;
-            int32_t largest = 0;
-            memcpy(&bound, &whole, sizeof bound);
-            bound -= most + span;
-            for (int i = 0; i < NEIGHBOURS; i++) largest = least[i] > largest ? least[i] : largest;
-            memcpy(&farthest, &largest, sizeof farthest);
-            if (k > 0 && bound > 0.0f && bound * bound > farthest) break; /* nothing nearer is left */
-            compare(x[0], s->centre + p * PATCH, faces, k * PATCH, least);
-            chosen[k] = p;
-        }
-        for (int i = 0; i < NEIGHBOURS; i++) {
-            const int32_t place = least[i] & (PLACES - 1);
-            s->nearest[vertex[i]] = chosen[place / PATCH] * PATCH + place % PATCH;
+            s->nearest_between[asked[i]] = face[i] < 0 ? 0 : face[i];
+            s->target_between[asked[i]] = face[i] < 0 ? -FARTHEST : f->offset;
         }
     }
 }
 
-/* The plane of the face that is nearest to a vertex. */
-static void find_planes(const psi_model *m, psi_state *s) {
+/* The planes [4][wide] of the faces that are nearest. */
+static void find_planes(const psi_model *m, const psi_state *s, const int32_t *nearest, size_t wide, float *planes) {
     const forces *f = &m->f;
-    const int32_t wide = padded(f->vertices), faces = padded(f->faces), body = padded(f->body);
+    const int32_t faces = padded(f->faces), body = padded(f->body);
     const float *cx = s->centre, *cy = cx + faces, *cz = cy + faces;
-    for (int32_t v = 0; v < wide; v += LANES) {
+    for (size_t v = 0; v < wide; v += LANES) {
         for (int i = 0; i < LANES; i++) {
-            const int32_t j = s->nearest[v + i];
+            const int32_t j = nearest[v + i];
             float e[3], l[3], normal[3];
             for (int c = 0; c < 3; c++) {
                 const float *p = s->body + c * body;
@@ -809,14 +843,14 @@ static void find_planes(const psi_model *m, psi_state *s) {
             cross(e, l, normal);
             const float square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
             const float size = square > 1e-30f ? inverse_root(square) : 0.0f;
-            float *plane = s->plane + v + i;
+            float *plane = planes + v + i;
             for (int c = 0; c < 3; c++) plane[c * wide] = size * normal[c];
             plane[3 * wide] = plane[0] * cx[j] + plane[wide] * cy[j] + plane[2 * wide] * cz[j];
         }
     }
 }
 
-/* Raises the planes of an edge's ends by how far the body, if it is round, bulges out between them. */
+/* How far the planes of an edge's ends are raised: as far as the body, if it is round, bulges out between them. */
 static void raise_planes(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
     const int32_t wide = padded(f->vertices), edges = padded(f->edges);
@@ -835,15 +869,14 @@ static void raise_planes(const psi_model *m, psi_state *s) {
             if (raised[end[i]] < b) raised[end[i]] = b;
         }
     }
-    for (int32_t v = 0; v < wide; v++) s->plane[3 * wide + v] += raised[v];
 }
 
-/* Pushes the garment out of its planes, as springs would. */
+/* Pushes the garment out of its raised planes, as springs would. */
 static void push_contact(const psi_model *m, psi_state *s, float *restrict force) {
     const size_t wide = padded(m->f.vertices);
     const float *plane = s->plane, *x = s->held, stiffness = m->f.stiffness, offset = m->f.offset;
     for (size_t v = 0; v < wide; v++) {
-        float gap = -plane[3 * wide + v];
+        float gap = -plane[3 * wide + v] - s->raised[v];
         for (size_t c = 0; c < 3; c++) gap += plane[c * wide + v] * x[c * wide + v];
         const float push = gap < offset ? stiffness * (offset - gap) : 0.0f;
         for (size_t c = 0; c < 3; c++) force[c * wide + v] = push * plane[c * wide + v];
@@ -1036,8 +1069,8 @@ static float awake(const psi_model *m, psi_state *s) {
     return s->still > AWAKE ? powf(SLOWING, s->still - AWAKE) : 1.0f;
 }
 
-/* The next code from the forces on the held garment at the new pose, in s->next. */
-static void predict_from_forces(const psi_model *m, psi_state *s) {
+/* The next code from the forces on the held garment at the new pose, in s->next; and what is touched, if `shown`. */
+static void predict_from_forces(const psi_model *m, psi_state *s, int shown) {
     const forces *f = &m->f;
     const size_t wide = padded(f->vertices);
     const int32_t code = m->code;
@@ -1050,8 +1083,11 @@ static void predict_from_forces(const psi_model *m, psi_state *s) {
     memset(elastic, 0, 3 * wide * sizeof(float));
     push_stretching(f, s->held, elastic);
     push_bending(f, s->held, elastic);
-    find_nearest(m, s);
-    find_planes(m, s);
+    const int32_t edge_clusters = shown ? f->edge_clusters : 0;
+    if (edge_clusters) find_middles(f, s);
+    find_nearest(m, s, edge_clusters);
+    find_planes(m, s, s->nearest, wide, s->plane);
+    if (edge_clusters) find_planes(m, s, s->nearest_between, padded(f->edges), s->plane_between);
     raise_planes(m, s);
     push_contact(m, s, s->force + 6 * wide);
     pull_back(m, s);
@@ -1110,12 +1146,12 @@ static void carry_back(const forces *f, const psi_state *s, const float *before,
     }
 }
 
-/* Relaxes the garment that is posed in s->held: drape._hung. What it moves by stays in the last rows of s->force. */
+/* Relaxes the garment that is posed in s->held: drape._hung. What it moves by stays in the last rows of s->force, for
+   what is shown. */
 static void relax(const forces *f, psi_state *s) {
     const size_t wide = padded(f->vertices);
     float *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
     memcpy(before, s->held, 3 * wide * sizeof(float));
-    memset(canonical, 0, 3 * wide * sizeof(float));
     for (int32_t n = 0; n < f->relaxation; n++) ease(f, s);
     carry_back(f, s, before, canonical);
     for (size_t i = 0; i < 3 * wide; i++) s->garment[i] += canonical[i];
@@ -1128,6 +1164,7 @@ static void drape(const psi_model *m, psi_state *s) {
     const float *garment = decode(m, s, m->apart ? &f->felt_shapes : &m->shapes), still[3] = {0, 0, 0};
     for (int c = 0; c < 3; c++) memcpy(s->garment + c * wide, garment + c * count, count * sizeof(float));
     apply(s->blended, s->garment, still, wide, s->held);
+    memset(s->force + 6 * wide, 0, 3 * wide * sizeof(float));
     if (f->relaxation) relax(f, s);
     for (int c = 0; c < 3; c++) {
         const float advance = s->translation[c] - s->translation[3 + c];
@@ -1137,18 +1174,57 @@ static void drape(const psi_model *m, psi_state *s) {
     for (int32_t i = 0; i < m->code; i++) s->change[i] = s->latent[i] - s->next[i];
 }
 
-/* How far the garment in s->held is from its planes; `advance` leads to it from the last root. */
-static inline float gap_of(const psi_state *s, size_t wide, size_t v, const float *advance) {
-    const float *n = s->plane + v, *x = s->held + v;
-    return n[0] * (x[0] + advance[0]) + n[wide] * (x[wide] + advance[1]) + n[2 * wide] * (x[2 * wide] + advance[2]) -
-           n[3 * wide];
+/* How far positions [3][wide] are from planes [4][wide]; `advance` leads to them from the last root. */
+static inline float gap_of(const float *plane, const float *x, size_t wide, size_t v, const float *advance) {
+    plane += v, x += v;
+    return plane[0] * (x[0] + advance[0]) + plane[wide] * (x[wide] + advance[1]) +
+           plane[2 * wide] * (x[2 * wide] + advance[2]) - plane[3 * wide];
 }
 
+/* How far outside of planes positions [3][wide] are pushed: to `target`, and by `deepest` at most. */
+static void find_targets(const forces *f, const float *plane, const float *x, size_t wide, const float *advance,
+                         float *target) {
+    for (size_t v = 0; v < wide; v++) {
+        const float farthest = gap_of(plane, x, wide, v, advance) + f->deepest;
+        target[v] = farthest < target[v] ? farthest : target[v];
+    }
+}
+
+static inline float limited(float depth, float most) { return depth > 0.0f ? (depth < most ? depth : most) : 0.0f; }
+
+/* Pushes the ends of edges as their middles are to be pushed: contact_search.edges_pushed_out. */
+static void push_edges(const forces *f, psi_state *s, const float *advance) {
+    const size_t wide = padded(f->vertices), edges = padded(f->edges);
+    float *total = s->force; /* [3], and how many edges push */
+    find_middles(f, s);
+    memset(total, 0, 4 * wide * sizeof(float));
+    for (int32_t first = 0; first < f->edges; first += LANES) {
+        const int32_t count = f->edges - first < LANES ? f->edges - first : LANES;
+        float push[LANES];
+        for (int i = 0; i < LANES; i++) {
+            const float gap = gap_of(s->plane_between, s->between, edges, first + i, advance);
+            push[i] = limited(s->target_between[first + i] - gap, f->deepest);
+        }
+        for (int i = 0; i < count; i++) {
+            if (push[i] == 0.0f) continue;
+            for (int end = 0; end < 2; end++) {
+                float *sum = total + f->edge[end * edges + first + i];
+                for (int c = 0; c < 3; c++) sum[c * wide] += push[i] * s->plane_between[c * edges + first + i];
+                sum[3 * wide] += 1.0f;
+            }
+        }
+    }
+    for (size_t v = 0; v < wide; v++)
+        for (int c = 0; c < 3; c++)
+            s->held[c * wide + v] += total[c * wide + v] / (total[3 * wide + v] > 1.0f ? total[3 * wide + v] : 1.0f);
+}
+
+/* Pushes the garment in s->held out of what it touches, vertices last. */
 static void push_held(const forces *f, psi_state *s, const float *advance) {
     const size_t wide = padded(f->vertices);
+    if (f->edge_clusters) push_edges(f, s, advance);
     for (int32_t v = 0; v < f->vertices; v++) {
-        const float gap = gap_of(s, wide, v, advance), depth = gap < s->target[v] ? s->target[v] - gap : 0.0f,
-                    push = depth < f->deepest ? depth : f->deepest;
+        const float push = limited(s->target[v] - gap_of(s->plane, s->held, wide, v, advance), f->deepest);
         for (int c = 0; c < 3; c++) s->held[c * wide + v] += push * s->plane[c * wide + v];
     }
 }
@@ -1156,22 +1232,19 @@ static void push_held(const forces *f, psi_state *s, const float *advance) {
 /* Pushes the garment in s->held out of the body and relaxes it, in turn: drape.shown_outside. */
 static void lift(const psi_model *m, psi_state *s) {
     const forces *f = &m->f;
-    const size_t wide = padded(f->vertices);
+    const size_t wide = padded(f->vertices), edges = padded(f->edges);
     float advance[3], *canonical = s->force + 6 * wide;
     for (int c = 0; c < 3; c++) advance[c] = s->translation[c] - s->translation[3 + c];
-    for (int32_t v = 0; v < f->vertices; v++) {
-        const float farthest = gap_of(s, wide, v, advance) + f->deepest;
-        s->target[v] = farthest < f->offset ? farthest : f->offset;
-    }
+    for (size_t v = 0; v < wide; v++) s->target[v] = f->offset;
+    find_targets(f, s->plane, s->held, wide, advance, s->target);
+    if (f->edge_clusters) find_middles(f, s);
+    if (f->edge_clusters) find_targets(f, s->plane_between, s->between, edges, advance, s->target_between);
     for (int32_t n = 0; n < f->relaxation; n++) {
         push_held(f, s, advance);
         ease(f, s);
     }
-    if (!m->apart) {
-        push_held(f, s, advance);
-    } else if (f->relaxation) { /* what is shown takes part in it */
-        carry_back(f, s, s->position, canonical);
-    }
+    push_held(f, s, advance);
+    if (m->apart) carry_back(f, s, s->position, canonical); /* what is shown takes part in it */
 }
 
 /* The garment that is shown where another feels: it takes part in how that one is relaxed. */
@@ -1179,7 +1252,7 @@ static const float *decode_apart(const psi_model *m, psi_state *s) {
     const size_t count = m->vertices, rows = padded(m->vertices), wide = padded(m->f.vertices);
     const float *moved = s->force + 6 * wide;
     float *garment = decode(m, s, &m->shapes);
-    for (int c = 0; m->f.relaxation && c < 3; c++)
+    for (int c = 0; c < 3; c++)
         for (size_t v = 0; v < count; v++)
             for (int k = 0; k < 3; k++)
                 garment[c * count + v] += m->f.share[k * rows + v] * moved[c * wide + m->f.around[k * rows + v]];
@@ -1200,8 +1273,7 @@ static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
         const float *plane = s->plane + m->f.around[v];
         float *x = vertices + 3 * v, gap = -plane[3 * wide];
         for (int c = 0; c < 3; c++) gap += plane[c * wide] * (x[c] - last[c]);
-        const float target = s->target[m->f.around[v]], depth = gap < target ? target - gap : 0.0f,
-                    push = depth < m->f.deepest ? depth : m->f.deepest;
+        const float push = limited(s->target[m->f.around[v]] - gap, m->f.deepest);
         for (int c = 0; c < 3; c++) x[c] += push * plane[c * wide];
     }
 }
@@ -1233,7 +1305,7 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     bones(m, s);
     int ordinary = 1;
     if (m->forced) {
-        predict_from_forces(m, s);
+        predict_from_forces(m, s, vertices != NULL);
     } else {
         pose_inputs(m, s, s->inputs);
         for (int32_t i = 0; i < m->pose.inputs; i++) s->inputs[i] -= m->pose_mean[i];
@@ -1285,11 +1357,17 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->held = part(room, &used, 3 * vertices);
     s->blended = part(room, &used, 12 * vertices);
     s->force = part(room, &used, 3 * KINDS * vertices);
-    s->patch = part(room, &used, 5 * (size_t)padded(m->f.faces / PATCH));
+    s->patch = part(room, &used, 4 * (size_t)padded(m->f.faces / PATCH));
+    s->near = (int8_t *)part(room, &used, padded(m->f.faces / PATCH) / sizeof(float));
     s->nearest = (int32_t *)part(room, &used, vertices);
     s->plane = part(room, &used, 4 * vertices);
     s->raised = part(room, &used, vertices);
     s->target = part(room, &used, vertices);
+    const size_t edges = m->f.edge_clusters ? padded(m->f.edges) : 0;
+    s->between = part(room, &used, 3 * edges);
+    s->nearest_between = (int32_t *)part(room, &used, edges);
+    s->plane_between = part(room, &used, 4 * edges);
+    s->target_between = part(room, &used, edges);
     s->body = part(room, &used, 3 * (size_t)padded(m->f.body));
     s->centre = part(room, &used, 3 * (size_t)padded(m->f.faces));
     for (int k = 0; k < KINDS; k++) s->pulled[k] = part(room, &used, 2 * (size_t)m->widest);

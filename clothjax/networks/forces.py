@@ -48,10 +48,7 @@ def touching_edges(mesh: Mesh, config: PhysicsConfig) -> Array:
 
 
 def felt(position: Array, surface: tuple[Array, Array], clusters: Clusters, edges: Array) -> Contact:
-    """Return the planes that Psi feels: of the body's face whose centroid is nearest to a vertex.
-
-    They are raised, so that edges over a round body stay outside of it between their ends: by the height of an arc
-    over its chord, (n_a - n_b) . (x_a - x_b) / 8 for normals n at its ends x. A vertex has that of its highest edge.
+    """Return the planes that Psi feels, `raised`: of the body's face whose centroid is nearest to a vertex.
 
     Args:
         position: [V, 3] m, the held garment at the next frame.
@@ -59,15 +56,27 @@ def felt(position: Array, surface: tuple[Array, Array], clusters: Clusters, edge
         clusters: of the garment's vertices and of the faces' centroids.
         edges: [E, 2] int32, of `touching_edges`.
     """
-    points, normals = surface
-    face = nearest_in_clusters(position, points, clusters)
-    normal = normals[face]
-    start, end = edges.T
+    return raised(planes(surface, nearest_in_clusters(position, surface[0], clusters)), position, edges)
+
+
+def planes(surface: tuple[Array, Array], face: Array) -> Contact:
+    """Return the planes [V] of faces [V] of a surface, as of `felt`."""
+    point, normal = (row[face] for row in surface)
+    return Contact(point, point, normal, normal, face)
+
+
+def raised(planes: Contact, position: Array, edges: Array) -> Contact:
+    """Return planes that are raised, so that edges over a round body stay outside of it between their ends.
+
+    That is by the height of an arc over its chord, (n_a - n_b) . (x_a - x_b) / 8 for normals n at its ends x. A vertex
+    has that of its highest edge. Arguments as of `felt`.
+    """
+    normal, (start, end) = planes.normal, edges.T
     bulge = jnp.sum((normal[start] - normal[end]) * (position[start] - position[end]), axis=-1) / 8
     bulge = jnp.minimum(bulge, HIGHEST)
-    raised = jnp.zeros_like(position[:, 0]).at[edges.T].max(bulge)
-    point = points[face] + raised[:, None] * normal
-    return Contact(point, point, normal, normal, face)
+    height = jnp.zeros_like(position[:, 0]).at[edges.T].max(bulge)
+    point = planes.point + height[:, None] * normal
+    return planes._replace(point=point, point_next=point)
 
 
 def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Array:

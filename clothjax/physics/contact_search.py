@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from clothjax.geometry.clusters import Clusters, divided
+from clothjax.geometry.clusters import Clusters, divided, middles
 from clothjax.geometry.proximity import (
     Patches,
     closest_on_triangle,
@@ -162,9 +162,9 @@ def find_at_centroids(
     return Contact(point[face], point_next[face], normal[face], normal_next[face], nearest_point(positions, body))
 
 
-def clusters(garment: Garment, body: Body) -> Clusters:
-    """Divide a garment's vertices and the centroids of a body's faces into clusters, on the host."""
-    return divided(garment.vertices, np.asarray(body.vertices)[np.asarray(body.faces)].mean(axis=1))
+def clusters(garment: Garment, body: Body, edges: Int[Array, "E 2"]) -> Clusters:
+    """Divide a garment's vertices, with some edges, and the centroids of a body's faces into clusters, on the host."""
+    return divided(garment.vertices, np.asarray(body.vertices)[np.asarray(body.faces)].mean(axis=1), edges)
 
 
 def centroids(
@@ -195,6 +195,24 @@ def pushed_out(
     """
     depth = jnp.clip(apart - distance(positions, points, normals), 0.0, farthest)
     return positions + depth[:, None] * normals
+
+
+def edges_pushed_out(
+    positions: Float[Array, "V 3"],
+    edges: Int[Array, "E 2"],
+    points: Float[Array, "E 3"],
+    normals: Float[Array, "E 3"],
+    apart: Float[Array, " E"],
+    farthest: float,
+) -> Float[Array, "V 3"]:
+    """Return positions [V, 3] m, the ends of edges moved as `pushed_out` moves their middles.
+
+    A vertex is moved by the mean over its edges of those that are moved.
+    """
+    depth = jnp.clip(apart - distance(middles(positions, edges), points, normals), 0.0, farthest)[:, None]
+    rows = jnp.concatenate([depth * normals, jnp.where(depth > 0, 1.0, 0.0)], axis=1)
+    total = jnp.zeros_like(positions, shape=(len(positions), 4)).at[edges.T].add(rows)
+    return positions + total[:, :3] / jnp.maximum(total[:, 3:], 1.0)
 
 
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:

@@ -3,11 +3,14 @@
 Garments are [3, V], coordinate by coordinate, because processors are fast at long rows.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from clothjax.body import skinning
 from clothjax.config import Config
+from clothjax.geometry.clusters import middles, nearest_and_of_edges
 from clothjax.networks import forces, psi
 from clothjax.physics import contact_search, incremental_potential, relaxation
 from clothjax.physics.incremental_potential import TimeStep
@@ -19,6 +22,15 @@ STILL = 2.5e-5  # of the rotation matrices, and in m: a pose that changes by les
 AWAKE = 60  # frames that the cloth moves freely for on a body that stands still; then ...
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
 DEEPEST = 0.02  # m, by which a vertex is pushed out at most: what seems deeper is beside the body, behind a plane's end
+REACH = 0.05  # m, farther from the middle of an edge the centroid of a face is not touched: its plane is ...
+SUNK = 10.0  # m ... that deep in the body
+
+
+class Touched(NamedTuple):
+    """Planes of the body that a garment may touch."""
+
+    vertices: Contact
+    edges: Contact  # at their middles
 
 
 def blend_weights(network: Network, latent: Array, config: Config) -> Array:
@@ -44,32 +56,41 @@ def shown(model: Model, latent: Array, transforms: Array, moved: Array | float =
     return _skin(_rows(model.network.weights, transforms), garment + moved).T
 
 
-def shown_outside(model: Model, latent: Array, drape: Drape, planes: Contact, transforms: Array) -> Array:
+def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, transforms: Array) -> Array:
     """Return the vertices [V, 3] m of a Psi with forces, where the body pushes no more; arguments of `shown`.
 
-    The garment that feels is pushed out and relaxed, in turn: what is only pushed out is stretched. The state does not
-    know of this.
+    The garment that feels is pushed out, edges and vertices, and relaxed, in turn: what is only pushed out is
+    stretched. The state does not know of this.
 
     Args:
         drape: after the step; what it feels is often what is shown.
-        planes: of `predict`, relative to the root's translation.
+        touched: of `predict`, relative to the root's translation.
     """
-    felt, outside = _forces(model).felt, drape.position
-    gap = contact_search.distance(outside, planes.point_next, planes.normal_next)
-    apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
+    parts, offset, outside = _forces(model), model.config.physics.collision_offset, drape.position
+    edges = forces.touching_edges(parts.mesh, model.config.physics)
 
-    def pushed_out(garment: Array, nearest: Array | slice = slice(None)) -> Array:
-        point, normal = planes.point_next[nearest], planes.normal_next[nearest]
-        return contact_search.pushed_out(garment, point, normal, apart[nearest], DEEPEST)
+    def targets(positions: Array, planes: Contact) -> tuple[Array, Array, Array]:
+        point, normal = planes.point_next, planes.normal_next
+        gap = contact_search.distance(positions, point, normal)
+        return point, normal, jnp.minimum(offset, gap + DEEPEST)
+
+    of_vertices = targets(outside, touched.vertices)
+    of_edges = targets(middles(outside, edges), touched.edges)
+
+    def pushed_out(garment: Array) -> Array:
+        garment = contact_search.edges_pushed_out(garment, edges, *of_edges, DEEPEST)
+        return contact_search.pushed_out(garment, *of_vertices, DEEPEST)
 
     for _ in range(relaxation_steps(model)):
         outside = _relaxed(model, pushed_out(outside), 1)
-    if felt is None:
-        return pushed_out(outside)
+    outside = pushed_out(outside)
+    if parts.felt is None:
+        return outside
     back = skinning.unapply_direction(_matrices(model, transforms), outside - drape.position)
     moved = drape.garment + back.T - _canonical(model, latent, *felt_garment(model))
-    taken = jnp.sum(moved[:, felt.around] * felt.shares[None], axis=-1)  # what is shown takes part in it
-    return pushed_out(shown(model, latent, transforms, taken), felt.nearest)
+    taken = jnp.sum(moved[:, parts.felt.around] * parts.felt.shares[None], axis=-1)  # what is shown takes part in it
+    point, normal, apart = (row[parts.felt.nearest] for row in of_vertices)
+    return contact_search.pushed_out(shown(model, latent, transforms, taken), point, normal, apart, DEEPEST)
 
 
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:
@@ -95,7 +116,7 @@ def stood(drape: Drape, rotations: Array, advance: Array, external: Array | None
 
 def predict(
     model: Model, latent: Array, drape: Drape, transforms: Array, pose: Pose, advance: Array, external: Array | None
-) -> tuple[Array, Contact]:
+) -> tuple[Array, Touched]:
     """Predict the next code from the forces on the held garment at the next frame.
 
     Args:
@@ -106,7 +127,7 @@ def predict(
         external: [3] m/s^2 or None, as of `inference.step`.
 
     Returns:
-        The code [L], not yet clipped, and the planes that the garment touches, as of `forces.felt`.
+        The code [L], not yet clipped, and what the held garment touches, relative to the root's new translation.
     """
     parts, cloth, config = _forces(model), model.wearer.cloth, model.config
     assert cloth is not None
@@ -116,14 +137,15 @@ def predict(
     body = skinning.pose_corrected(parts.corrections, cloth.body, pose)
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
     surface, edges = contact_search.centroids(posed, parts.faces), forces.touching_edges(parts.mesh, config.physics)
-    planes = forces.felt(held, surface, parts.clusters, edges)
+    nearest, of_edges = nearest_and_of_edges(held, surface[0], parts.clusters, edges)
+    planes = forces.planes(surface, nearest)
     step = TimeStep(
         position=drape.position,
         velocity=incremental_potential.pushed(drape.velocity, timestep, external),
         mass=cloth.mass,
         rest=cloth.rest,
         material=cloth.material,
-        contact=planes,
+        contact=forces.raised(planes, held, edges),
         touching=None,
         timestep=jnp.float32(timestep),
     )
@@ -142,7 +164,11 @@ def predict(
         config.stage2,
         SLOWING ** jnp.maximum(drape.still - AWAKE, 0.0),
     )
-    return code, planes._replace(point_next=planes.point_next - advance[None])
+    at_edges = forces.planes(surface, of_edges)
+    far = jnp.sum((middles(held, edges) - at_edges.point) ** 2, axis=-1) > REACH**2
+    sunk = at_edges.point_next - jnp.where(far, SUNK, 0.0)[:, None] * at_edges.normal_next
+    touched = Touched(planes, at_edges._replace(point_next=sunk))
+    return code, Touched(*(each._replace(point_next=each.point_next - advance[None]) for each in touched))
 
 
 def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms: Array, advance: Array) -> Drape:

@@ -96,7 +96,7 @@ def _advanced(
     )
     advance = translation[:2] - translation[1:]
     transforms = _transforms(model, global_rotations, joints)
-    hung, planes = state.drape, None
+    hung, touched = state.drape, None
     if isinstance(network.predictor, PosePredictor):
         if external is not None:
             raise ValueError(NOT_FELT)
@@ -107,7 +107,7 @@ def _advanced(
         assert hung is not None
         ordinary = True
         hung = drape.stood(hung, rotations[:2], advance[0], external)
-        latent, planes = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
+        latent, touched = drape.predict(model, state.latent, hung, transforms, pose, advance[0], external)
     latent, inside = normalisation.bounded(latent, *network.code_bounds)
     if hung is not None:
         hung = drape.follow(model, latent, state.latent, hung, transforms, advance[0])
@@ -115,10 +115,10 @@ def _advanced(
     following = State(latent, rotations[:2], positions[:2], translation[:2], outside, hung)
     if not vertices:
         return following, None
-    if hung is None or planes is None:
+    if hung is None or touched is None:
         shown = drape.shown(model, latent, transforms)
     else:
-        shown = drape.shown_outside(model, latent, hung, planes, transforms)
+        shown = drape.shown_outside(model, latent, hung, touched, transforms)
     return following, shown + pose.translation[None]
 
 

@@ -14,7 +14,7 @@ from clothjax.config import Config
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.networks import normalisation, psi
+from clothjax.networks import forces, normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.physics import contact_search, energies, relaxation
 from clothjax.runtime import trained
@@ -70,8 +70,8 @@ def build(
     touched = mesh = clusters = None
     if isinstance(normalizers, ForceScales):
         touched = reach.reachable(body, garment, config.physics.reach)
-        clusters = contact_search.clusters(garment, touched)
         mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
+        clusters = contact_search.clusters(garment, touched, forces.touching_edges(mesh, config.physics))
     network, wearer = _arrays(
         garment, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas, material, config
     )
@@ -106,7 +106,7 @@ def _arrays(
 
     Args:
         touched: the part of the body that is felt, ...
-        clusters: ... its faces and the garment's vertices in clusters, and ...
+        clusters: ... its faces and the garment's vertices and edges in clusters, and ...
         mesh: ... the elements that feel; None without forces.
     """
     given = psi.constant_inputs(betas, material, config.material)

@@ -49,5 +49,32 @@ def test_a_wide_cluster_is_as_near_as_its_border_may_be():
     tight = (means + 0.01 * random.normal(size=(len(means), clusters.GIVEN, 3))).reshape(-1, 3)
     wide = np.stack([np.linspace(0.1, 1.2, clusters.GIVEN), *np.zeros((2, clusters.GIVEN))], axis=1)
     points = np.concatenate([tight, wide]).astype(np.float32)
-    divided = clusters.Clusters(np.zeros((1, 1), np.int32), np.arange(len(points)).reshape(-1, clusters.GIVEN))
+    given = np.arange(len(points)).reshape(-1, clusters.GIVEN)
+    divided = clusters.Clusters(np.zeros((1, 1), np.int32), given, np.zeros((1, 0), np.int32))
     assert clusters.nearest_in_clusters(np.zeros((1, 3), np.float32), points, divided) == len(tight)
+
+
+def test_middles_of_edges_find_what_is_nearest_to_them():
+    """Beside one of their ends; some positions have no edges, as those of a pinned waist."""
+    random = np.random.default_rng(0)
+    sphere, faces = icosphere(4)
+    points = sphere[faces].mean(axis=1).astype(np.float32)
+    positions, triangles = icosphere(3)
+    positions = (1.05 * positions).astype(np.float32)
+    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    edges = np.unique(sides, axis=0)
+    edges = edges[(positions[edges][:, :, 1] < 0.5).all(axis=1)].astype(np.int32)
+    divided = clusters.divided(positions, points, edges)
+    own = np.zeros(len(positions), int)
+    own[divided.positions] = np.arange(len(divided.positions))[:, None]
+    assert (divided.edges.max(axis=1) < 0).any() and set(divided.edges[divided.edges >= 0]) == set(range(len(edges)))
+    for cluster, beside in enumerate(divided.edges):
+        assert all((own[edges[edge]] == cluster).any() for edge in beside if edge >= 0)
+    assert divided.edges.shape[1] <= 32
+    moved = (positions + 0.02 * random.normal(size=positions.shape)).astype(np.float32)
+    nearest, of_edges = jax.jit(clusters.nearest_and_of_edges)(moved, points, divided, edges)
+    middles = moved[edges].mean(axis=1)
+    for places, found in ((moved, nearest), (middles, of_edges)):
+        distances = cdist(places, points)
+        assert np.mean(distances[np.arange(len(places)), found] > distances.min(axis=1) + 1e-6) < 0.01
+    np.testing.assert_array_equal(nearest, clusters.nearest_in_clusters(moved, points, divided))

@@ -447,3 +447,19 @@ def test_positions_are_pushed_out_along_the_normals_by_no_more_than_they_may():
     for farthest, expected in ((0.02, [0.02, 0.003, 0.003, -0.04]), (0.005, [0.02, 0.003, 0.001, -0.045])):
         found = contact_search.pushed_out(position, point, normal, apart, farthest)
         np.testing.assert_allclose(found, point + jnp.array(expected)[:, None] * normal + across, atol=2e-6)
+
+
+def test_ends_of_edges_are_pushed_out_as_their_middles_and_by_the_mean_of_edges():
+    position = jnp.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0], [6.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    edges = jnp.array([[0, 1], [1, 2], [2, 3]])
+    normal = jnp.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    point = jnp.array([[5.0, 5.0, 0.01], [0.0, 0.002, 0.0], [0.0, -0.01, 0.0]])
+    pushed = contact_search.edges_pushed_out(position, edges, point, normal, jnp.full(3, 0.003), 0.02)
+    expected = jnp.array([[0, 0, 0.013], [0, 0.0025, 0.0065], [0, 0.005, 0], [0, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(pushed - position, expected, atol=1e-6)
+    pushed = contact_search.edges_pushed_out(position, edges, point, normal, jnp.full(3, 0.003), 0.004)
+    expected = jnp.array([[0, 0, 0.004], [0, 0.002, 0.002], [0, 0.004, 0], [0, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(pushed - position, expected, atol=1e-6)
+    np.testing.assert_array_equal(
+        contact_search.edges_pushed_out(position, edges[:0], point[:0], normal[:0], jnp.zeros(0), 0.02), position
+    )

@@ -7,13 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from samples import random_force_psi, random_model
+from scipy.spatial.distance import cdist
 
 import clothjax as cj
 from clothjax.body import skinning
 from clothjax.evaluation import rollouts
+from clothjax.geometry.clusters import middles
 from clothjax.geometry.vectors import at_corners
 from clothjax.material import configured_material
-from clothjax.networks import animators, forces, normalisation, phi
+from clothjax.networks import animators, normalisation, phi
 from clothjax.physics import contact_search, energies
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import drape, inference, loading, specialise, trained
@@ -80,8 +82,8 @@ def test_it_is_the_animator_of_training(kind, motion, request):
     assert min(moved) > 1e-3  # it does not merely hold the code
 
 
-def test_vertices_are_its_garment_in_the_world_outside_of_what_it_feels(forced, model, motion):
-    """The planes are those of the held garment at the new pose, found here by the scene of training."""
+def test_vertices_are_its_garment_in_the_world_outside_of_what_it_touches(forced, model, motion):
+    """The planes are those of the held garment at the new pose, found here by the scene of training and brute force."""
     experiment = forced.experiment
     config, scene = experiment.config, experiment.scene
     character = characters.dress(
@@ -90,29 +92,44 @@ def test_vertices_are_its_garment_in_the_world_outside_of_what_it_feels(forced, 
     before = inference.initial_state(model, pose(motion, 1))
     after, vertices = inference.step(model, before, pose(motion, 2))
     window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
-    held = phi.decode(forced.garment, scene, character, before.latent, window, config.model)
-    planes = forces.felt(held, characters.surface(scene, window.following), scene.clusters, scene.mesh.edges)
-    garment = np.asarray(after.drape.position + motion.translation[2][None])
-    root, point, normal = (np.asarray(x) for x in (motion.translation[1], planes.point_next, planes.normal_next))
+    held = np.asarray(phi.decode(forced.garment, scene, character, before.latent, window, config.model))
+    points, normals = (np.asarray(x) for x in characters.surface(scene, window.following))
+    edges, offset, root = np.asarray(scene.mesh.edges), config.physics.collision_offset, motion.translation[1]
 
-    def apart(vertices):
-        return np.sum((np.asarray(vertices) - root - point) * normal, axis=1)
+    def planes(places):
+        apart = cdist(places, points)
+        face = apart.argmin(axis=1)
+        return points[face], normals[face], apart.min(axis=1)
 
-    depth = config.physics.collision_offset - apart(garment)
-    outside, far = depth <= 0, depth > drape.DEEPEST
-    assert min(outside.sum(), far.sum(), (~outside & ~far).sum()) > 10
-    moved = np.asarray(vertices) - garment
-    np.testing.assert_allclose(moved[outside], 0.0, atol=1e-6)
-    np.testing.assert_allclose(moved[far], drape.DEEPEST * normal[far], atol=2e-5)
-    np.testing.assert_allclose(apart(vertices)[~outside & ~far], config.physics.collision_offset, atol=2e-5)
-    np.testing.assert_allclose(np.cross(moved, normal), 0.0, atol=2e-5)  # by the shortest way
+    def gap(places, plane):
+        return np.sum((places - plane[0]) * plane[1], axis=1)
+
+    def depth(places, plane, target):
+        return np.clip(target - gap(places, plane), 0.0, drape.DEEPEST)[:, None]
+
+    own, between = planes(held), planes(held[edges].mean(axis=1))
+    hung = np.asarray(after.drape.position) + motion.translation[2] - root
+    both = ((hung, own), (hung[edges].mean(axis=1), between))
+    targets = [np.minimum(offset, gap(places, plane) + drape.DEEPEST) for places, plane in both]
+    push = depth(hung[edges].mean(axis=1), between, np.where(between[2] < drape.REACH, targets[1], -np.inf))
+    total, count = np.zeros_like(hung), np.zeros((len(hung), 1))
+    for end in edges.T:
+        np.add.at(total, end, push * between[1])
+        np.add.at(count, end, push > 0)
+    expected = hung + total / np.maximum(count, 1)
+    expected = expected + depth(expected, own, targets[0]) * own[1]
+    apart = np.linalg.norm(np.asarray(vertices) - root - expected, axis=1)
+    assert np.mean(apart < 2e-5) > 0.97  # a face of another cluster may be nearest
+    by_edges = np.linalg.norm(expected - hung - depth(hung, own, targets[0]) * own[1], axis=1) > 1e-4
+    assert by_edges.sum() > 30 and (gap(hung, own) < offset - drape.DEEPEST).sum() > 10
+    assert 10 < (between[2] >= drape.REACH).sum() < len(edges) - 100
     unseen, nothing = inference.step(model, before, pose(motion, 2), False)
     assert nothing is None
     np.testing.assert_allclose(unseen.latent, after.latent, atol=1e-6)
 
 
 def test_what_is_pushed_out_is_relaxed_outside_of_the_body(relaxing, motion):
-    """It has less stretching energy than where it is only pushed out, and is as far outside."""
+    """It has less stretching energy than where it is only pushed out, is as far outside, and so are its edges."""
     model = relaxing.model()
     state, cloth = inference.initial_state(model, pose(motion, 0)), model.wearer.cloth
     mesh, offset = model.network.predictor.mesh, model.config.physics.collision_offset
@@ -123,24 +140,37 @@ def test_what_is_pushed_out_is_relaxed_outside_of_the_body(relaxing, motion):
         terms = energies.stretching(corners, rest.inverse, rest.face_area, cloth.material.mu, cloth.material.lam)
         return float(jnp.sum(terms))
 
-    lower = []
+    lower, shallower = [], []
     for t in range(1, 6):
         rotations, joints = skinning.forward_kinematics(
             pose(motion, t).rotations, model.wearer.joints, np.array(model.parents)
         )
         transforms = inference._transforms(model, rotations, joints)
         advance = pose(motion, t).translation - pose(motion, t - 1).translation
-        _, planes = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
+        _, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
         state, vertices = inference.step(model, state, pose(motion, t))
         vertices -= pose(motion, t).translation[None]
-        gap = contact_search.distance(state.drape.position, planes.point_next, planes.normal_next)
+
+        def targets(x, planes):
+            gap = contact_search.distance(x, planes.point_next, planes.normal_next)
+            return gap, jnp.minimum(offset, gap + drape.DEEPEST)
+
+        planes, hung = touched.vertices, state.drape.position
+        gap, apart = targets(hung, planes)
         found = contact_search.distance(vertices, planes.point_next, planes.normal_next)
         assert jnp.sum((gap < offset) & (gap > offset - drape.DEEPEST)) > 20
-        apart = jnp.minimum(offset, gap + drape.DEEPEST)
-        push = (planes.point_next, planes.normal_next, apart, drape.DEEPEST)
         assert jnp.all(found > apart - 1e-5)
-        lower.append(stretching(vertices) / stretching(contact_search.pushed_out(state.drape.position, *push)))
-    assert max(lower) < 0.7
+        push = (planes.point_next, planes.normal_next, apart, drape.DEEPEST)
+        only = contact_search.pushed_out(hung, *push)
+        at, (_, apart) = touched.edges, targets(middles(hung, mesh.edges), touched.edges)
+        by_edges = (mesh.edges, at.point_next, at.normal_next, apart, drape.DEEPEST)
+        stiff = contact_search.pushed_out(contact_search.edges_pushed_out(hung, *by_edges), *push)
+        lower.append(stretching(vertices) / stretching(stiff))
+        depths = [
+            jnp.maximum(apart - targets(middles(x, mesh.edges), touched.edges)[0], 0.0).sum() for x in (vertices, only)
+        ]
+        shallower.append(float(depths[0] / depths[1]))
+    assert max(lower) < 0.9 and max(shallower) < 0.5
 
 
 def test_an_acceleration_against_gravity_is_no_gravity(forced, motion):
@@ -202,12 +232,17 @@ def test_a_part_and_another_mesh_feel_what_the_whole_feels(kind, motion, request
     whole, _ = inference.animate(model, motion)
     vertices = np.arange(0, 500)
     seen, _ = inference.animate(specialise.part(model, vertices), motion)
-    np.testing.assert_allclose(seen, whole[:, vertices], atol=1e-5)
+
+    def same(found, expected):
+        # a vertex that its edges push into the body is not pushed out by more than the limit at once
+        assert np.mean(np.linalg.norm(found - expected, axis=-1) < 1e-5) > 0.999
+
+    same(seen, whole[:, vertices])
     mesh = specialise.on_mesh(model, forced.experiment.garment, np.linspace(-1, 1, 10))  # the same one, as another
     assert mesh.network.predictor.felt is not None
     again, _ = inference.animate(specialise.part(mesh, vertices), motion)
-    np.testing.assert_allclose(again, whole[:, vertices], atol=1e-5)
-    np.testing.assert_allclose(inference.animate(mesh, motion)[0], whole, atol=1e-5)
+    same(again, whole[:, vertices])
+    same(inference.animate(mesh, motion)[0], whole)
     with pytest.raises(ValueError, match="shows another mesh, or a part, already"):
         specialise.on_mesh(mesh, forced.experiment.garment, np.zeros(10))
 
