@@ -28,8 +28,8 @@ from clothjax.runtime.models import (
 from clothjax.types import Material, Mesh, Rest
 
 # of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`. With forces, they
-# know 3, where nothing relaxed, and no older one
-FORMAT, WITH_FORCES = 4, 3
+# know none that is older than 5
+FORMAT, WITH_FORCES = 5, 5
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
 
 
@@ -95,10 +95,6 @@ def from_safetensors(path: str | Path) -> Model:
             params = {
                 name.removeprefix(within).replace(".", "/"): x for name, x in arrays.items() if name.startswith(within)
             }
-            older = arrays.pop(f"{own}.felt.nearest", None)  # of format 3, where nothing relaxed
-            if older is not None:
-                arrays[f"{own}.felt.around"] = jnp.repeat(older[:, None], 3, axis=1)
-                arrays[f"{own}.felt.shares"] = jnp.zeros((len(older), 3)).at[:, 0].set(1.0)
             felt = fields(Felt, f"{own}.felt") if f"{own}.felt.shapes" in arrays else None
             whitening = fields(Whitening, f"{own}.scales.whitening")
             scales = fields(ForceScales, f"{own}.scales", whitening=whitening)
