@@ -126,7 +126,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
     spring = 3.0 * forces.DEPTH * physics.collision_stiffness  # N/m
-    rates = [1 / model.config.fps, weight, spring, physics.collision_offset, forces.HIGHEST, drape.DEEPEST]
+    rates = [1 / model.config.fps, weight, spring, physics.collision_offset, forces.HIGHEST, drape.DEEPEST, drape.REACH]
     yield np.array(rates, np.float32)
     size = np.asarray(rest.face_area) * THICKNESS
     stiffness = 0.0 if "bending" in physics.without else np.asarray(cloth.material.bending)

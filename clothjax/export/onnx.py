@@ -10,7 +10,7 @@ import numpy as np
 from clothjax.export import onnx_drape, onnx_forces, sidecar
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.export.sidecar import Output
-from clothjax.runtime import inference, specialise
+from clothjax.runtime import drape, inference, specialise
 from clothjax.runtime.models import FoldedLayer, ForcePredictor, Layer, Model, PosePredictor
 from clothjax.types import Array, Motion, Pose
 
@@ -156,7 +156,8 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
             placed = onnx_drape.shown_outside(g, model, garment, hung, touched, rows, transforms, advance)
         placed = g("Add", placed, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
-        garment = onnx_drape.shown_apart(g, model, garment, hung) if hung and apart else garment
+        if hung is not None and apart and drape.relaxation_steps(model) > 0:
+            garment = onnx_drape.shown_apart(g, model, garment, hung)
         placed = g.reshape(garment, 3, vertices)
     g("Transpose", placed, perm=[0, 2, 1], name="vertices")
     return given, following | {"vertices": (batch, vertices, 3)}, g

@@ -14,7 +14,7 @@ from clothjax.export.onnx_graph import Graph
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.physics import relaxation
-from clothjax.runtime import drape
+from clothjax.runtime import drape, inference
 from clothjax.runtime.models import ForcePredictor, Layer, Model
 
 DRAPE = ("change", "garment", "position", "velocity", "still")  # of the state, beside `latent` and `history`
@@ -31,7 +31,8 @@ class Touched(NamedTuple):
     """Planes that the garment may touch, as of `drape.Touched`."""
 
     vertices: Planes
-    edges: Planes | None  # None if edges do not touch, or if nothing is shown
+    edges: Planes | None  # None if edges do not touch, or if nothing is shown; ...
+    far: str  # [N, 1, E] ... which touch none of these planes
 
 
 def next_code(
@@ -52,13 +53,12 @@ def next_code(
     surface, clusters = onnx_forces.surface(g, it, transforms, advance), it.predictor.clusters
     among = onnx_forces.searched(g, clusters, held, surface[0])
     planes, at_edges = onnx_forces.nearest_planes(g, among, held, np.asarray(clusters.positions), surface), None
+    far = ""
     if shown and len(edges) > 0:
         middles = _middles(g, held, edges)
-        point, normal = onnx_forces.nearest_planes(g, among, middles, np.asarray(clusters.edges), surface)
-        apart = g("Sub", middles, point)
+        at_edges = onnx_forces.nearest_planes(g, among, middles, np.asarray(clusters.edges), surface)
+        apart = g("Sub", middles, at_edges[0])
         far = g("Greater", g.dot(apart, apart), np.float32(drape.REACH**2))
-        far = g("Mul", g("Cast", far, to=g.onnx.TensorProto.FLOAT), np.float32(drape.SUNK))
-        at_edges = g("Sub", point, g("Mul", far, normal)), normal
     kinds = [
         onnx_forces.momentum(g, model, it, held),
         onnx_forces.elasticity(g, model, it, held),
@@ -70,7 +70,7 @@ def next_code(
     carried_back = g("ReduceSum", carried_back, np.array([2], np.int64), keepdims=0)  # [N, kinds, 3, V]
     flat = g.reshape(carried_back, len(KINDS), int(np.prod(it.template.shape)))
     pulls = _pulled_back(g, model, g("MatMul", flat, np.asarray(it.felt.shapes).T))
-    return _predicted(g, model, it, pulls, _awake(g, turned, advance)), Touched(planes, at_edges)
+    return _predicted(g, model, it, pulls, _awake(g, turned, advance)), Touched(planes, at_edges, far)
 
 
 class Hung(NamedTuple):
@@ -125,7 +125,10 @@ def shown_outside(
         return point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset))
 
     of_vertices = targets(outside, touched.vertices)
-    of_edges = None if touched.edges is None else targets(_middles(g, outside, edges), touched.edges)
+    of_edges = None
+    if touched.edges is not None:
+        point, normal, apart = targets(_middles(g, outside, edges), touched.edges)
+        of_edges = point, normal, g("Where", touched.far, np.float32(-inference.FARTHEST), apart)
 
     def pushed_out(garment: str) -> str:
         if of_edges is not None:

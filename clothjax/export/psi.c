@@ -8,6 +8,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#define PLAIN 1           /* version of a file without forces; ... */
+#define FORCED 5          /* ... and with them */
 #define ALIGN 64          /* bytes, of all arrays */
 #define FARTHEST 1e6f     /* m from the origin */
 #define MOST_JOINTS 1024
@@ -18,10 +20,9 @@
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
 #define KINDS 3           /* of forces: momentum, elasticity, contact */
-#define NEIGHBOURS 8      /* vertices of a cluster */
+#define NEIGHBOURS 8      /* vertices, or edges, of a cluster */
 #define PATCH 16          /* faces of the body in one */
-#define REACH 0.05f        /* m, farther from the middle of an edge a face does not touch it */
-#define PLACES 512        /* a power of two: faces that are compared before it is noted which are nearest */
+#define PLACES 512        /* a power of two; PATCH fewer faces are compared before it is noted which are nearest */
 #define BOUND 5.0f        /* of the scaled inputs of a predictor with forces */
 #define SLIVER 1e-6f      /* twice the area, over a hinge's squared size, below which a face has no direction */
 #define SETTLING 60       /* frames that a garment with forces settles for before the first */
@@ -48,7 +49,8 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
     int32_t vertices, triangles, hinges, body, faces, clusters, edges, edge_clusters, relaxation;
     float timestep, gravity;
-    float stiffness, offset, highest, deepest;        /* of planes that are touched: in N/m; m; raised, pushed at most */
+    float stiffness, offset;                          /* N/m and m, of planes that are touched; ... */
+    float highest, deepest, reach;                    /* ... m, raised, pushed, and far from an edge at most */
     const float *mass;                                /* [vertices] */
     const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
     const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
@@ -235,7 +237,7 @@ static exact read_exact(reader *r, psi_model *m) {
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
     const int32_t *head = integers(r, 10);
-    const float *rates = floats(r, 6);
+    const float *rates = floats(r, 7);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
     f->triangles = within(r, head[1], 0, MOST_ELEMENTS);
@@ -249,7 +251,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->edge_clusters = within(r, head[8], 0, MOST_ELEMENTS / NEIGHBOURS);
     f->relaxation = within(r, head[9], 0, MOST_STEPS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
-    f->highest = rates[4], f->deepest = rates[5];
+    f->highest = rates[4], f->deepest = rates[5], f->reach = rates[6];
     f->mass = floats(r, padded(f->vertices));
     f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
     f->inverse = floats(r, 4 * (size_t)padded(f->triangles));
@@ -327,10 +329,10 @@ static psi_model *failed(psi_model *m, const char **error, const char *why) {
 }
 
 static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char **error) {
-    const int32_t name = 0x00495350; /* "PSI"; then the version, 1 or, with forces, 5 */
+    const int32_t name = 0x00495350; /* "PSI"; then the version */
     int32_t version[2] = {0, 0};
     if (size >= ALIGN) memcpy(version, bytes, sizeof version);
-    if (version[0] != name || (version[1] != 1 && version[1] != 5)) return failed(m, error, "not a .psi of this version");
+    if (version[0] != name || (version[1] != PLAIN && version[1] != FORCED)) return failed(m, error, "not a .psi of this version");
     reader r = {bytes, size, 1};
     read_model(&r, m);
     if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
@@ -702,7 +704,7 @@ static void push_momentum(const psi_model *m, psi_state *s, float *restrict forc
 /* Middles and radii of the clusters of faces. */
 static void find_patches(const psi_model *m, psi_state *s) {
     const int32_t faces = padded(m->f.faces), patches = m->f.faces / PATCH, row = padded(patches);
-    float *restrict middle = s->patch, *restrict radius = middle + 3 * row;
+    float *middle = s->patch, *radius = middle + 3 * row;
     for (int32_t p = 0; p < patches; p++) {
         const float *centre = s->centre + p * PATCH;
         float apart[PATCH] = {0}, farthest = 0.0f;
@@ -747,56 +749,69 @@ static void find_middles(const forces *f, psi_state *s) {
     }
 }
 
-/* Takes over which faces are nearest, of the clusters that were compared. */
-static void settle_faces(int32_t *least, const int32_t *chosen, int32_t *face) {
+/* Takes over which faces are nearest, of the clusters that were compared; returns the number of the next one. */
+static int32_t settle_faces(int32_t *least, const int32_t *chosen, int32_t *face) {
     for (int i = 0; i < NEIGHBOURS; i++) {
         const int32_t place = least[i] & (PLACES - 1);
         if (place >= PATCH) face[i] = chosen[place / PATCH] * PATCH + place % PATCH;
         least[i] -= place;
     }
+    return 1;
 }
 
-/* Finds the faces whose centres are nearest to the positions of a cluster, rows [3][wide] at `asked`, among those that
-   are not farther than `reach`; without one they stay as they are. The distance to the centres of faces `seen` bounds
-   the search. Which they are does not change what is found. */
+/* Finds the faces whose centres are nearest to the positions of a cluster, rows [3][wide] at `asked`, if they are not
+   farther than `reach`; else they stay as they are. In jax it is clusters.nearest_in_clusters, which may miss some. */
 static void find_faces(const psi_model *m, const psi_state *s, const float *rows, size_t wide, const int32_t *asked,
-                       const int32_t *seen, float reach, int32_t *face) {
+                       float reach, int32_t *face) {
     const int32_t faces = padded(m->f.faces), patches = m->f.faces / PATCH, row = padded(patches);
-    const float *restrict middle = s->patch, *restrict radius = middle + 3 * row;
-    const float most = reach * reach;
-    int8_t *restrict near = s->near;
-    float x[3][NEIGHBOURS], mean[3] = {0}, span = 0.0f, farthest = 0.0f;
-    int32_t least[NEIGHBOURS], chosen[PLACES / PATCH], count = 1; /* a place before PATCH: found before these were */
-    memcpy(least, &most, sizeof least[0]);
-    for (int i = 0; i < NEIGHBOURS; i++) least[i] = least[0] & ~(PLACES - 1);
+    const float *middle = s->patch, *radius = middle + 3 * row;
+    float x[3][NEIGHBOURS], mean[3] = {0}, span = 0.0f;
+    int32_t least[NEIGHBOURS], chosen[PLACES / PATCH], count = 1, bits = 1, nearest = INT32_MAX;
     for (int c = 0; c < 3; c++)
         for (int i = 0; i < NEIGHBOURS; i++) mean[c] += (x[c][i] = rows[c * wide + asked[i]]) / NEIGHBOURS;
+    const float most = reach * reach;
+    memcpy(least, &most, sizeof least[0]);
+    least[0] &= ~(PLACES - 1); /* a place in the first PATCH: found before */
     for (int i = 0; i < NEIGHBOURS; i++) {
-        float apart = 0.0f, square = 0.0f;
-        for (int c = 0; c < 3; c++) {
-            const float a = x[c][i] - mean[c], b = x[c][i] - s->centre[c * faces + seen[i]];
-            apart += a * a, square += b * b;
-        }
-        span = apart > span ? apart : span;
-        farthest = square > farthest ? square : farthest;
+        const float a = x[0][i] - mean[0], b = x[1][i] - mean[1], c = x[2][i] - mean[2];
+        least[i] = least[0];
+        span = a * a + b * b + c * c > span ? a * a + b * b + c * c : span;
     }
-    farthest = sqrtf(farthest < most ? farthest : most);
-    const float within = (sqrtf(span) + farthest) * 1.001f; /* for rounding, and the last bits of distances */
+    /* the cluster of faces whose middle is nearest tells how far the nearest faces are at most */
+    while (bits < patches) bits *= 2;
+    for (int32_t p = 0; p < patches; p++) {
+        const float a = middle[p] - mean[0], b = middle[row + p] - mean[1], c = middle[2 * row + p] - mean[2];
+        const float square = a * a + b * b + c * c;
+        int32_t whole;
+        memcpy(&whole, &square, sizeof whole);
+        whole = (whole & ~(bits - 1)) | p;
+        nearest = whole < nearest ? whole : nearest;
+    }
+    const int32_t best = nearest & (bits - 1);
+    if (best >= patches) return; /* nothing is finite */
+    chosen[count] = best;
+    compare(x[0], s->centre + best * PATCH, faces, PATCH * count++, least);
+    int32_t largest = 0;
+    for (int i = 0; i < NEIGHBOURS; i++) largest = least[i] > largest ? least[i] : largest;
+    float farthest;
+    largest |= PLACES - 1;
+    memcpy(&farthest, &largest, sizeof farthest);
+    const float within = (sqrtf(span) + sqrtf(farthest)) * 1.001f + 1e-6f; /* for rounding */
+    int8_t *near = s->near;
     for (int32_t p = 0; p < patches; p++) {
         const float a = middle[p] - mean[0], b = middle[row + p] - mean[1], c = middle[2 * row + p] - mean[2];
         const float bound = radius[p] + within;
         near[p] = a * a + b * b + c * c <= bound * bound;
     }
+    near[best] = 0;
     for (int32_t first = 0; first < patches; first += 8) {
         int64_t any;
         memcpy(&any, near + first, sizeof any);
         for (int32_t p = first; any && p < first + 8; p++) {
             if (!near[p]) continue;
-            compare(x[0], s->centre + p * PATCH, faces, count * PATCH, least);
-            chosen[count++] = p;
-            if (count < PLACES / PATCH) continue;
-            settle_faces(least, chosen, face);
-            count = 1;
+            if (count == PLACES / PATCH) count = settle_faces(least, chosen, face);
+            chosen[count] = p;
+            compare(x[0], s->centre + p * PATCH, faces, PATCH * count++, least);
         }
     }
     settle_faces(least, chosen, face);
@@ -809,20 +824,21 @@ static void find_nearest(const psi_model *m, psi_state *s, int32_t edge_clusters
     find_patches(m, s);
     for (int32_t g = 0; g < f->clusters; g++) {
         const int32_t *asked = f->cluster + g * NEIGHBOURS;
-        int32_t face[NEIGHBOURS];
-        for (int i = 0; i < NEIGHBOURS; i++) face[i] = s->nearest[asked[i]];
-        find_faces(m, s, s->held, wide, asked, face, FARTHEST, face);
+        int32_t face[NEIGHBOURS] = {0};
+        find_faces(m, s, s->held, wide, asked, FARTHEST, face);
         for (int i = 0; i < NEIGHBOURS; i++) s->nearest[asked[i]] = face[i];
     }
+    for (size_t e = 0; edge_clusters && e < edges; e++) s->nearest_between[e] = -1;
     for (int32_t g = 0; g < edge_clusters; g++) {
         const int32_t *asked = f->edge_cluster + g * NEIGHBOURS;
-        int32_t face[NEIGHBOURS], seen[NEIGHBOURS];
-        for (int i = 0; i < NEIGHBOURS; i++) face[i] = -1, seen[i] = s->nearest[f->edge[asked[i]]];
-        find_faces(m, s, s->between, edges, asked, seen, REACH, face);
-        for (int i = 0; i < NEIGHBOURS; i++) {
-            s->nearest_between[asked[i]] = face[i] < 0 ? 0 : face[i];
-            s->target_between[asked[i]] = face[i] < 0 ? -FARTHEST : f->offset;
-        }
+        int32_t face[NEIGHBOURS];
+        for (int i = 0; i < NEIGHBOURS; i++) face[i] = -1;
+        find_faces(m, s, s->between, edges, asked, f->reach, face);
+        for (int i = 0; i < NEIGHBOURS; i++) s->nearest_between[asked[i]] = face[i];
+    }
+    for (size_t e = 0; edge_clusters && e < edges; e++) {
+        s->target_between[e] = s->nearest_between[e] < 0 ? -FARTHEST : f->offset;
+        s->nearest_between[e] = s->nearest_between[e] < 0 ? 0 : s->nearest_between[e];
     }
 }
 

@@ -27,9 +27,8 @@ from clothjax.runtime.models import (
 )
 from clothjax.types import Material, Mesh, Rest
 
-# of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`. With forces, they
-# know none that is older than 5
-FORMAT, WITH_FORCES = 5, 5
+FORMAT = 5  # of the file; readers refuse a newer one, and know 1, where a Psi without forces had no `predictor`
+WITH_FORCES = 5  # the oldest format with forces that they know
 STATIC = {"names": "names", "parents": "parents", "kept": "input_joints", "moving": "moving"}  # header: field
 
 

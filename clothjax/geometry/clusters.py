@@ -60,7 +60,15 @@ def nearest_and_of_edges(positions: Array, points: Array, clusters: Clusters, ed
     """Return `nearest_in_clusters`, and the index [E] of the point nearest to the middle of each edge [E, 2].
 
     That is searched for in the same clusters of points as the nearest to one of the edge's ends. No gradient.
+
+    Args:
+        edges: those that `divided` got.
+
+    Raises:
+        ValueError: for edges that are not in the clusters.
     """
+    if (len(edges) > 0) != (clusters.edges.shape[1] > 0):
+        raise ValueError(f"the clusters were divided without these {len(edges)} edges, or for others")
     positions, points, clusters = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, (positions, points, clusters)))
     near = _near(positions, points, clusters)
     return (

@@ -56,10 +56,10 @@ def felt(position: Array, surface: tuple[Array, Array], clusters: Clusters, edge
         clusters: of the garment's vertices and of the faces' centroids.
         edges: [E, 2] int32, of `touching_edges`.
     """
-    return raised(planes(surface, nearest_in_clusters(position, surface[0], clusters)), position, edges)
+    return raised(planes_of(surface, nearest_in_clusters(position, surface[0], clusters)), position, edges)
 
 
-def planes(surface: tuple[Array, Array], face: Array) -> Contact:
+def planes_of(surface: tuple[Array, Array], face: Array) -> Contact:
     """Return the planes [V] of faces [V] of a surface, as of `felt`."""
     point, normal = (row[face] for row in surface)
     return Contact(point, point, normal, normal, face)

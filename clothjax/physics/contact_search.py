@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from clothjax.geometry.clusters import Clusters, divided, middles
+from clothjax.geometry.clusters import NO_EDGES, Clusters, divided, middles
 from clothjax.geometry.proximity import (
     Patches,
     closest_on_triangle,
@@ -162,8 +162,8 @@ def find_at_centroids(
     return Contact(point[face], point_next[face], normal[face], normal_next[face], nearest_point(positions, body))
 
 
-def clusters(garment: Garment, body: Body, edges: Int[Array, "E 2"]) -> Clusters:
-    """Divide a garment's vertices, with some edges, and the centroids of a body's faces into clusters, on the host."""
+def clusters(garment: Garment, body: Body, edges: Int[Array, "E 2"] = NO_EDGES) -> Clusters:
+    """Divide a garment's vertices, with edges, and the centroids of a body's faces into clusters, on the host."""
     return divided(garment.vertices, np.asarray(body.vertices)[np.asarray(body.faces)].mean(axis=1), edges)
 
 
@@ -207,7 +207,7 @@ def edges_pushed_out(
 ) -> Float[Array, "V 3"]:
     """Return positions [V, 3] m, the ends of edges moved as `pushed_out` moves their middles.
 
-    A vertex is moved by the mean over its edges of those that are moved.
+    A vertex is moved by the mean over those of its edges that are moved.
     """
     depth = jnp.clip(apart - distance(middles(positions, edges), points, normals), 0.0, farthest)[:, None]
     rows = jnp.concatenate([depth * normals, jnp.where(depth > 0, 1.0, 0.0)], axis=1)

@@ -21,16 +21,16 @@ HIGHEST = jax.lax.Precision.HIGHEST
 STILL = 2.5e-5  # of the rotation matrices, and in m: a pose that changes by less stands still
 AWAKE = 60  # frames that the cloth moves freely for on a body that stands still; then ...
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
-DEEPEST = 0.02  # m, by which a vertex is pushed out at most: what seems deeper is beside the body, behind a plane's end
-REACH = 0.05  # m, farther from the middle of an edge the centroid of a face is not touched: its plane is ...
-SUNK = 10.0  # m ... that deep in the body
+DEEPEST = 0.02  # m, by which a vertex or an edge is pushed out at most: what seems deeper is behind a plane's end
+REACH = 0.05  # m, farther from the middle of an edge a face, by its centroid, is not touched
 
 
 class Touched(NamedTuple):
     """Planes of the body that a garment may touch."""
 
     vertices: Contact
-    edges: Contact  # at their middles
+    edges: Contact  # of their middles, ...
+    far: Array  # [E] bool ... which touch none of these planes
 
 
 def blend_weights(network: Network, latent: Array, config: Config) -> Array:
@@ -75,7 +75,8 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
         return point, normal, jnp.minimum(offset, gap + DEEPEST)
 
     of_vertices = targets(outside, touched.vertices)
-    of_edges = targets(middles(outside, edges), touched.edges)
+    point, normal, apart = targets(middles(outside, edges), touched.edges)
+    of_edges = (point, normal, jnp.where(touched.far, -jnp.inf, apart))
 
     def pushed_out(garment: Array) -> Array:
         garment = contact_search.edges_pushed_out(garment, edges, *of_edges, DEEPEST)
@@ -138,7 +139,7 @@ def predict(
     posed = (_skin(_rows(parts.body, transforms), body.T) + advance[:, None]).T
     surface, edges = contact_search.centroids(posed, parts.faces), forces.touching_edges(parts.mesh, config.physics)
     nearest, of_edges = nearest_and_of_edges(held, surface[0], parts.clusters, edges)
-    planes = forces.planes(surface, nearest)
+    planes = forces.planes_of(surface, nearest)
     step = TimeStep(
         position=drape.position,
         velocity=incremental_potential.pushed(drape.velocity, timestep, external),
@@ -164,11 +165,13 @@ def predict(
         config.stage2,
         SLOWING ** jnp.maximum(drape.still - AWAKE, 0.0),
     )
-    at_edges = forces.planes(surface, of_edges)
+    at_edges = forces.planes_of(surface, of_edges)
     far = jnp.sum((middles(held, edges) - at_edges.point) ** 2, axis=-1) > REACH**2
-    sunk = at_edges.point_next - jnp.where(far, SUNK, 0.0)[:, None] * at_edges.normal_next
-    touched = Touched(planes, at_edges._replace(point_next=sunk))
-    return code, Touched(*(each._replace(point_next=each.point_next - advance[None]) for each in touched))
+
+    def rooted(planes: Contact) -> Contact:
+        return planes._replace(point_next=planes.point_next - advance[None])
+
+    return code, Touched(rooted(planes), rooted(at_edges), far)
 
 
 def follow(model: Model, latent: Array, before: Array, drape: Drape, transforms: Array, advance: Array) -> Drape:

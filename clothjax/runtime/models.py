@@ -83,7 +83,7 @@ class ForcePredictor(NamedTuple):
     scales: ForceScales
     mesh: Mesh  # of the garment's elements
     faces: Array  # [F, 3] int32 of the part of the body that can be touched
-    clusters: Clusters  # of the vertices that feel, and of the centroids of these faces
+    clusters: Clusters  # of the vertices that feel, with the edges that touch, and of the centroids of these faces
     body: Array  # [J', B] skinning weights of that part
     corrections: Array | None  # [B, 3, 9 (J - 1)] m, its pose blend shapes
     felt: Felt | None  # the garment that feels, if it is not the one that is shown

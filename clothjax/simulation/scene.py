@@ -66,18 +66,18 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
         strides=[level.stride for level in config.model.convolution],
         radii=[level.radius for level in config.model.convolution],
     )
-    touchable, mesh = config.physics.body != "none", topology.free_mesh(faces, np.asarray(garment.pinned))
+    touchable = config.physics.body != "none"
     within = reach.reachable(body, garment, config.physics.reach) if touchable else _bare(body)
     return Scene(
         garment=garment,
         body=within,
         still=config.physics.body == "still",
-        mesh=mesh,
+        mesh=topology.free_mesh(faces, np.asarray(garment.pinned)),
         graph=graph,
         level=mesh_hierarchy.vertex_levels(len(garment.vertices), levels).astype(np.int32),
         tables=tuple(Table(np.asarray(t.ids, np.int32), np.asarray(t.mask)) for t in hierarchy),
         patches=patches(np.asarray(within.vertices), np.asarray(within.faces)) if touchable else None,
-        clusters=contact_search.clusters(garment, within, mesh.edges) if touchable else None,
+        clusters=contact_search.clusters(garment, within) if touchable else None,
         garment_patches=patches(np.asarray(garment.vertices), faces),
     )
 

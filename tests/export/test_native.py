@@ -217,9 +217,10 @@ def test_c_feels_planes_raised_as_far_as_jax(forced, motion, monkeypatch):
         found = psi_ffi.step(psi_ffi.pack(model), state, at(motion, 1))[0].drape.change
         return jnp.clip(code, low, high) - state.latent, found
 
-    (high_model, high_c), (low_model, low_c) = changes(0.01), changes(0.002)
-    expected = high_model - low_model
-    assert jnp.linalg.norm(high_c - low_c - expected) < 0.5 * jnp.linalg.norm(expected)
+    (flat, flat_c), *others = (changes(height) for height in (0.0, 0.002, 0.01))
+    for model_change, found in others:
+        expected = model_change - flat
+        assert jnp.linalg.norm(found - flat_c - expected) < 0.2 * jnp.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed"])
@@ -232,7 +233,7 @@ def test_c_shows_what_is_outside_of_what_it_touches_as_the_model(forced, name, d
     model = forced[name]
     packed, state = psi_ffi.pack(model), inference.initial_state(model, at(motion, 0))
     felt, offset = model.network.predictor.felt, model.config.physics.collision_offset
-    nearest, by_edges = slice(None) if felt is None else felt.nearest, 0
+    nearest, by_edges = slice(None) if felt is None else felt.nearest, []
     for t in range(1, 5):
         transforms = inference._transforms(model, *kinematics(model, at(motion, t)))
         advance = at(motion, t).translation - at(motion, t - 1).translation
@@ -248,11 +249,12 @@ def test_c_shows_what_is_outside_of_what_it_touches_as_the_model(forced, name, d
         point, normal = planes.point_next[nearest], planes.normal_next[nearest]
         outside = contact_search.distance(vertices, point, normal) > jnp.minimum(offset, gap + deepest)[nearest] - 2e-5
         assert jnp.mean(outside) > 0.98
-        sunk = touched.edges.point_next - drape.SUNK * touched.edges.normal_next
-        without = touched._replace(edges=touched.edges._replace(point_next=sunk))
+        without = touched._replace(far=jnp.full_like(touched.far, True))
         moved = expected - drape.shown_outside(model, state.latent, state.drape, without, transforms)
-        by_edges += jnp.sum(jnp.linalg.norm(moved, axis=1) > 2e-3)
-    assert by_edges > 100 if model.config.physics.edge_contact else by_edges == 0
+        by_edges.append(apart[jnp.linalg.norm(moved, axis=1) > 2e-3])
+    by_edges = jnp.concatenate(by_edges)
+    if model.config.physics.edge_contact:
+        assert len(by_edges) > 100 and jnp.mean(by_edges < (2e-5 if felt is None else 1e-3)) > 0.9
 
 
 @pytest.mark.parametrize("moved", [0.0, 2e-5, 4e-5])
@@ -518,9 +520,9 @@ def test_a_state_of_nothing_finite_reads_nothing_beyond_its_arrays(tmp_path):
 
 def test_c_has_the_constants_of_the_search():
     """They are constants there: loops of a known length become vectors."""
-    said = dict(re.findall(r"#define (NEIGHBOURS|PATCH|PLACES|REACH) ([\d.]+)", native.SOURCES[1].read_text()))
+    said = dict(re.findall(r"#define (NEIGHBOURS|PATCH|PLACES) (\d+)", native.SOURCES[1].read_text()))
     neighbours, patch, places = (int(said[name]) for name in ("NEIGHBOURS", "PATCH", "PLACES"))
-    assert (neighbours, patch, float(said["REACH"])) == (clusters.ASKED, clusters.GIVEN, drape.REACH)
+    assert (neighbours, patch) == (clusters.ASKED, clusters.GIVEN)
     assert places >= 2 * patch and places & (places - 1) == 0
 
 

@@ -78,3 +78,6 @@ def test_middles_of_edges_find_what_is_nearest_to_them():
         distances = cdist(places, points)
         assert np.mean(distances[np.arange(len(places)), found] > distances.min(axis=1) + 1e-6) < 0.01
     np.testing.assert_array_equal(nearest, clusters.nearest_in_clusters(moved, points, divided))
+    assert of_edges[-1] == cdist(middles[-1:], points).argmin()  # -1 in a cluster without edges is not the last one
+    with pytest.raises(ValueError, match="divided without these 1 edges"):
+        clusters.nearest_and_of_edges(moved, points, clusters.divided(positions, points), edges[:1])
