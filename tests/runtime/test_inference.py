@@ -133,9 +133,7 @@ def test_a_garment_at_rest_can_be_left_alone(name):
     if state.drape is not None:
         moved = np.linalg.norm(state.drape.position - rested.drape.position, axis=1)
         assert moved.max() < 5e-5
-    # of all frames: a vertex between two faces that are equally near is pushed out of the one or the other
-    flickers = (np.array(apart) > 2e-4).any(axis=0)
-    assert flickers.sum() <= 3 and np.max(apart) < 1e-3
+    assert np.max(apart) < 2e-4  # of all frames: a vertex may be pushed out of the one or the other of two faces
 
 
 def test_psi_does_not_see_place_or_heading(trained):
