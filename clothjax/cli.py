@@ -1,4 +1,4 @@
-"""What all command-line programs share: the parser of arguments, the compilation cache, one-line error messages."""
+"""Shared by all command-line programs: the parser of arguments, the compilation cache, one-line error messages."""
 
 import argparse
 import contextlib

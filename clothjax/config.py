@@ -63,7 +63,7 @@ class PhysicsConfig:
     shaped_rest: bool = True
     """The rest shape follows the character's betas (a graded garment); false: always the template, as in HOOD."""
     contact_surface: Literal["triangles", "centroids"] = "triangles"
-    """What a garment vertex can touch: the nearest triangle of the body (`triangles`), or the plane of the body face
+    """Surface that a garment vertex can touch: the nearest triangle of the body (`triangles`), or the plane of the face
     whose centroid is nearest, as in HOOD (`centroids`)."""
     edge_contact: bool = True
     """Edges of the garment touch the body between their ends too, so that a limb does not slip through. Triangles only.
@@ -158,7 +158,7 @@ class ModelConfig:
     latent: int = 400
     """Wanted size L of the code; the actual one is the nearest multiple of the vertices that the convolution leaves."""
     latent_update: Literal["absolute", "descent"] = "descent"
-    """What Phi's network gives: the next code, as in the thesis (`absolute`), or a correction added to a guess of it
+    """Output of Phi's network: the next code, as in the thesis (`absolute`), or a correction added to a guess of it
     (`descent`). The guess starts at the current code, plus its last change if the potential is lower there, and takes
     `descent_steps` steps down the potential."""
     descent_steps: int = 32

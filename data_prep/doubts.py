@@ -1,4 +1,4 @@
-"""What a motion shows that is hardly meant, in words: it may be so, and the user is told."""
+"""Doubts about a motion, in words: it shows something that is hardly meant, and the user is told."""
 
 import numpy as np
 

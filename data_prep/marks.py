@@ -1,4 +1,4 @@
-"""What of a mesh is pinned or of another cloth: parts that its file marks, openings, and borders above a height."""
+"""Parts of a mesh that are pinned or of another cloth: marked by its file, openings, borders above a height."""
 
 from pathlib import Path
 

@@ -18,7 +18,7 @@ Planes = tuple[str, str]  # points and normals [N, 3, n]
 
 
 class Parts(NamedTuple):
-    """What a model with forces has, checked to be there."""
+    """Parts of a model with forces, checked to be there."""
 
     predictor: ForcePredictor
     cloth: Cloth

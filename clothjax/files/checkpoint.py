@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 class Checkpoint(NamedTuple):
-    """What a checkpoint says of itself, without its arrays."""
+    """Description of a checkpoint, without its arrays."""
 
     path: Path  # of its folder
     step: int  # training steps so far

@@ -17,7 +17,7 @@ from clothjax.networks.normalisation import ForceScales
 from clothjax.types import Array, Material, Mesh, Rest
 
 CAUSES = ("not finite", "pose", "wearer", "code")
-"""What may be out of the range of training: a pose that is no pose, the pose's inputs, the character, the code."""
+"""Causes of a frame outside of the range of training: no pose, inputs of the pose, the character, the code."""
 
 
 class Layer(NamedTuple):
@@ -28,7 +28,7 @@ class Layer(NamedTuple):
 
 
 class FoldedLayer(NamedTuple):
-    """What a specialised model keeps of a layer that reads the code: the bias alone.
+    """The rest of a layer that reads the code in a specialised model: the bias alone.
 
     The state of such a model carries the code's products with the kernels of these layers in place of the code
     (`specialise.without_code`).
@@ -123,7 +123,7 @@ class Network(NamedTuple):
 
 
 class Cloth(NamedTuple):
-    """What a Psi with forces must know of its character: its cloth, and the body that it can touch."""
+    """The cloth of a character with a Psi with forces, and the body that it can touch."""
 
     constants: Array  # [C] of `psi.constant_inputs`
     mass: Array  # [V] kg
@@ -182,7 +182,7 @@ class Drape(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a model carries from frame to frame."""
+    """The state that a model carries from frame to frame."""
 
     latent: Array  # [C] the code, in standard deviations; of a folded model its products with the layers that read it
     rotations: Array  # [2, J, 3, 3] local, of the last two poses, newest first

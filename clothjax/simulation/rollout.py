@@ -37,7 +37,7 @@ class StepOutput(NamedTuple):
 
 
 class Animator(NamedTuple):
-    """What moves one character's garment, a time step at a time: a network, or the physics itself."""
+    """Moves one character's garment, a time step at a time: a network, or the physics itself."""
 
     memory_size: int  # L, numbers carried from frame to frame
     step: Callable[[StepInput], StepOutput]
@@ -53,7 +53,7 @@ class Taken(NamedTuple):
 
 
 class Track(NamedTuple):
-    """What `play` records of a rollout of T frames."""
+    """Record by `play` of a rollout of T frames."""
 
     position: Array  # [T, V, 3] m after each step, relative to the root before it
     states: ClothState  # before each step, every leaf with a leading axis T

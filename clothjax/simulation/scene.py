@@ -22,7 +22,7 @@ class Table(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What all simulations of an experiment share, whatever their character and motion."""
+    """Shared by all simulations of an experiment, whatever their character and motion."""
 
     garment: Garment
     body: Body  # only the vertices that the garment can reach; none where there is no body to touch

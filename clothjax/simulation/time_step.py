@@ -1,4 +1,4 @@
-"""What one time step starts from: a garment as skinned, and the constants of the incremental potential."""
+"""Start of a time step: a garment as skinned, and the constants of the incremental potential."""
 
 from collections.abc import Callable
 

@@ -54,7 +54,7 @@ class Labels(NamedTuple):
 
 
 class Round(NamedTuple):
-    """What a round of labelling leaves."""
+    """Result of a round of labelling."""
 
     simulations: Simulation  # leaves [N, ...], where the next round goes on
     labels: Labels

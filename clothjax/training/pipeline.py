@@ -53,7 +53,7 @@ MAY_DIFFER = {
 
 
 class Run(NamedTuple):
-    """What every stage of a run's training needs: experiment, folder, clips and devices."""
+    """Experiment, folder, clips and devices, which every stage of a run's training needs."""
 
     experiment: Experiment
     directory: Path

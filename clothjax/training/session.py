@@ -15,7 +15,7 @@ from clothjax import progress
 
 
 class Call(NamedTuple):
-    """What one call of `update` gave; a call takes `steps_per_call` training steps."""
+    """Result of one call of `update`, which takes `steps_per_call` training steps."""
 
     state: Any  # after the call
     step: int  # after the call

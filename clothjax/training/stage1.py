@@ -195,7 +195,7 @@ def rollout_length(step: int, config: Config) -> int:
 
 
 class Problem(NamedTuple):
-    """What is the same at every training step."""
+    """Arguments of a training step that are the same at every one."""
 
     scene: Scene
     config: Config

@@ -25,7 +25,7 @@ ORDINARY_FRAMES = 10_000  # random frames that show which pose inputs are ordina
 
 
 class Teacher(NamedTuple):
-    """What Psi learns from: N rollouts of Phi, each of T + 1 codes, with the inputs that lead from each to the next."""
+    """Training data of Psi: N rollouts of Phi, each of T + 1 codes, with the inputs from each code to the next."""
 
     latents: Array  # [N, T + 1, L]; the first is zero, as Psi's state is before its first frame
     poses: Array  # [N, T, P] pose inputs
