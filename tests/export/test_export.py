@@ -18,9 +18,10 @@ from toy import assert_same, small
 
 from clothjax.body import skinning
 from clothjax.commands import convert
-from clothjax.export import frame, litert, native, onnx, onnx_drape, safetensors, stablehlo
-from clothjax.export.onnx_graph import session
+from clothjax.export import frame, litert, native, onnx, onnx_drape, onnx_forces, safetensors, stablehlo
+from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import storage
+from clothjax.geometry import clusters
 from clothjax.networks import forces
 from clothjax.physics import relaxation
 from clothjax.runtime import inference, specialise
@@ -377,6 +378,28 @@ def test_onnx_of_forces_raises_planes_as_far_as_jax(forced, motion, tmp_path, mo
     assert np.abs(found - np.asarray(usual)).max() > 1e-3
     monkeypatch.undo()
     jax.clear_caches()
+
+
+def test_onnx_searches_for_what_is_nearest_to_edges_as_jax(tmp_path):
+    """Some clusters have no edges, as at a pinned waist."""
+    random = np.random.default_rng(0)
+    positions, points = (random.normal(size=(count, 3)).astype(np.float32) for count in (200, 6000))
+    edges = np.stack([np.arange(0, 40, 2), np.arange(1, 40, 2)], axis=1)
+    near = clusters.divided(positions, points, edges)
+    assert (near.edges < 0).any()
+    order, g = np.asarray(near.points).reshape(-1), Graph()
+    among = onnx_forces.searched(g, near, "positions", "points")
+    middles = g.constant(positions[edges].mean(axis=1).T[None])
+    for name, rows, members in (("own", "positions", near.positions), ("between", middles, near.edges)):
+        point, _ = onnx_forces.nearest_planes(g, among, rows, np.asarray(members), ("points", "points"))
+        g("Identity", point, name=name)
+    given = {"positions": positions.T[None], "points": points[order].T[None]}
+    shapes = {"own": (1, 3, 200), "between": (1, 3, len(edges))}
+    g.save(tmp_path / "g.onnx", {name: x.shape for name, x in given.items()}, shapes)
+    found = session(tmp_path / "g.onnx").run(["own", "between"], given)
+    expected = clusters.nearest_and_of_edges(positions, points, near, edges)
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours[0].T, points[theirs])
 
 
 def test_onnx_of_forces_feels_an_acceleration(forced, motion, tmp_path):
