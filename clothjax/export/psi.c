@@ -332,7 +332,8 @@ static psi_model *parse(psi_model *m, const void *bytes, size_t size, const char
     const int32_t name = 0x00495350; /* "PSI"; then the version */
     int32_t version[2] = {0, 0};
     if (size >= ALIGN) memcpy(version, bytes, sizeof version);
-    if (version[0] != name || (version[1] != PLAIN && version[1] != FORCED)) return failed(m, error, "not a .psi of this version");
+    if (version[0] != name || (version[1] != PLAIN && version[1] != FORCED))
+        return failed(m, error, "not a .psi of this version");
     reader r = {bytes, size, 1};
     read_model(&r, m);
     if (!r.sound || r.left || !fits(m)) return failed(m, error, "a damaged .psi: convert it again");
@@ -788,7 +789,6 @@ static void find_faces(const psi_model *m, const psi_state *s, const float *rows
         nearest = whole < nearest ? whole : nearest;
     }
     const int32_t best = nearest & (bits - 1);
-    if (best >= patches) return; /* nothing is finite */
     chosen[count] = best;
     compare(x[0], s->centre + best * PATCH, faces, PATCH * count++, least);
     int32_t largest = 0;

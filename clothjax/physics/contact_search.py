@@ -193,8 +193,7 @@ def pushed_out(
 
     None is moved by more than `farthest` m.
     """
-    depth = jnp.clip(apart - distance(positions, points, normals), 0.0, farthest)
-    return positions + depth[:, None] * normals
+    return positions + _depth(positions, points, normals, apart, farthest)[:, None] * normals
 
 
 def edges_pushed_out(
@@ -209,10 +208,15 @@ def edges_pushed_out(
 
     A vertex is moved by the mean over those of its edges that are moved.
     """
-    depth = jnp.clip(apart - distance(middles(positions, edges), points, normals), 0.0, farthest)[:, None]
+    depth = _depth(middles(positions, edges), points, normals, apart, farthest)[:, None]
     rows = jnp.concatenate([depth * normals, jnp.where(depth > 0, 1.0, 0.0)], axis=1)
     total = jnp.zeros_like(positions, shape=(len(positions), 4)).at[edges.T].add(rows)
     return positions + total[:, :3] / jnp.maximum(total[:, 3:], 1.0)
+
+
+def _depth(positions: Array, points: Array, normals: Array, apart: Array, farthest: float) -> Array:
+    """Return how far [V] m positions are to be pushed out of planes; arguments as of `pushed_out`."""
+    return jnp.clip(apart - distance(positions, points, normals), 0.0, farthest)
 
 
 def _pseudonormal(body: Array, corners: Array, patches: Patches, face: Array, weights: Array) -> tuple[Array, Array]:
