@@ -357,7 +357,7 @@ class LabelsConfig:
     """Frames by which a round moves a simulation."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
-    descent_steps: int = 40
+    descent_steps: int = 64
     """Most descent steps of a label. They start where Psi is, so that later rounds go on from earlier."""
     tolerance: float = 1e-4
     """Share of the energy gained that a label may leave."""
@@ -370,6 +370,8 @@ class LabelsConfig:
     of gravity in a round. 0: none of these."""
     steps: int = 500
     """Training steps of a round."""
+    last_steps: int = 0
+    """Training steps on all frames after the last round, by a network drawn anew. 0: none."""
     batch: int = 256
     learning_rate: float = 5e-4
     decay: float = 0.05
@@ -384,6 +386,11 @@ class LabelsConfig:
         for name in ("rounds", "simulations", "frames"):
             _require(getattr(self, name) >= 1, f"labels.{name} must be >= 1, got {getattr(self, name)}")
         _require(all(0 <= share <= 1 for share in self.shares), f"labels.shares must be in [0, 1]: {self.shares}")
+
+    @property
+    def all_steps(self) -> int:
+        """Training steps of all rounds and after them."""
+        return self.rounds * self.steps + self.last_steps
 
 
 @dataclass(frozen=True)

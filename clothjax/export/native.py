@@ -11,7 +11,6 @@ import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import sidecar
@@ -166,9 +165,9 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     linear = predictor.params["linear"]
     first = _mlp(predictor)[0]
     kernel = np.concatenate([first.kernel, linear["kernel"]], axis=1).astype(np.float64)
-    constants = np.asarray(psi.scaled_inputs(scales, jnp.pad(cloth.constants, (inputs, 0))))[inputs:]
+    constants = np.asarray(psi.scaled_inputs(scales, cloth.constants))
     bias = np.concatenate([first.bias, linear["bias"]]) + constants @ kernel[inputs:]
-    yield from _layer(Layer(kernel[:inputs], bias))
+    yield from _layer(Layer(kernel[:inputs], bias), gains=True)
     yield from _exact(np.asarray(scales.output) * back)
     if predictor.felt is not None:
         yield from _layer(Layer(felt.shapes, template.reshape(-1)), gains=True)

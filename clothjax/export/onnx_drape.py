@@ -5,7 +5,6 @@ It follows `clothjax/runtime/drape.py`. A row of vectors is [N, 3, n], of scalar
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from clothjax.export import onnx_forces
@@ -272,7 +271,7 @@ def _predicted(g: Graph, model: Model, it: Parts, pulls: str, share: str) -> str
     spread = psi.BOUND * np.asarray(scales.spread)[:inputs]
     seen = g("Tanh", g("Div", g("Sub", seen, np.asarray(scales.middle)[:inputs]), spread))
     seen = g("Mul", seen, np.float32(psi.BOUND))
-    constants = np.asarray(psi.scaled_inputs(scales, jnp.pad(it.cloth.constants, (inputs, 0))))[inputs:]
+    constants = np.asarray(psi.scaled_inputs(scales, it.cloth.constants))
 
     def reading(layer: dict) -> Layer:
         kernel = np.asarray(layer["kernel"])

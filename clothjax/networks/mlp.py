@@ -35,11 +35,15 @@ class Dense(nn.Module):
 
     def __call__(self, x: Array) -> jax.Array:
         """Return [..., outputs] of x [..., inputs]."""
-        return self.product(x) + self.bias.reshape((1,) * (x.ndim - 1) + self.bias.shape)
+        return self.biased(self.product(x))
 
     def product(self, x: Array, begin: int = 0) -> jax.Array:
         """Multiply x [..., n] by the n rows of the kernel from `begin` on, without the bias."""
         return x @ self.kernel[begin : begin + x.shape[-1]]
+
+    def biased(self, product: jax.Array) -> jax.Array:
+        """Add the bias to products [..., outputs]."""
+        return product + self.bias.reshape((1,) * (product.ndim - 1) + self.bias.shape)
 
 
 def apply(module: nn.Module, params: Params, *arguments: Any, **options: Any) -> Any:

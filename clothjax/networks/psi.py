@@ -126,22 +126,61 @@ def force_inputs(code: Array, change: Array, forces: Array, constants: Array, wh
 
 
 def scaled_inputs(scales: ForceScales, inputs: Array) -> Array:
-    """Return inputs [N] of `force_inputs`, scaled and softly bounded to +-`BOUND`."""
-    return BOUND * jnp.tanh((inputs - scales.middle) / (BOUND * scales.spread))
+    """Return inputs [N] of `force_inputs`, or the last n of them, scaled and softly bounded to +-`BOUND`."""
+    middle, spread = (row[-len(inputs) :] for row in (scales.middle, scales.spread))
+    return BOUND * jnp.tanh((inputs - middle) / (BOUND * spread))
 
 
 class ForcePsi(nn.Module):
-    """The latent predictor of a Psi with forces: a linear map, which starts as the ridge solution, beside an MLP."""
+    """The latent predictor of a Psi with forces: a linear map, which starts as the ridge solution, beside an MLP.
+
+    The character scales inputs and layers: feature-wise modulation (FiLM, Perez et al. 2018), as stiff cloth answers a
+    force otherwise than soft. The network of one character, which `of_character` returns, has no scales.
+    """
 
     config: Stage2Config
     latent: int  # L
+    constants: int = 0  # C last inputs that scale; 0 in the network of one character
 
     @nn.compact
     def __call__(self, inputs: Array) -> Array:
         """Return the change [..., L] of the whitened code, over `ForceScales.output`, from `scaled_inputs` [..., N]."""
         linear = mlp.Dense(inputs.shape[-1], self.latent, name="linear")
         layers = MLP((inputs.shape[-1], *self.config.hidden, self.latent), False, 1e-3, name="mlp")
-        return linear(inputs) + layers(inputs)
+        if self.constants == 0:
+            return linear(inputs) + layers(inputs)
+        felt, constants = inputs[..., : -self.constants], inputs[..., -self.constants :]
+        sizes = {"inputs": felt.shape[-1], "linear": self.latent} | {
+            f"dense_{i}": size for i, size in enumerate(self.config.hidden)
+        }
+        zeros = {name: jnp.zeros((self.constants, size)) for name, size in sizes.items()}
+        scales = {name: 1.0 + constants @ kernel for name, kernel in self.param("character", lambda _: zeros).items()}
+        seen = jnp.concatenate([felt * scales["inputs"], constants], axis=-1)
+        x, (*hidden, last) = seen, layers.dense
+        for number, layer in enumerate(hidden):
+            x = nn.relu(layer.biased(layer.product(x) * scales[f"dense_{number}"]))
+        return linear.biased(linear.product(seen) * scales["linear"]) + last(x)
+
+
+def of_character(params: Params, constants: Array) -> Params:
+    """Return the parameters of `ForcePsi` for one character: its scales are in the kernels.
+
+    Args:
+        params: of all characters, or of one, which are returned as they are.
+        constants: [C], the last of `scaled_inputs`.
+    """
+    if "character" not in params:
+        return params
+    scales = {name: 1.0 + constants @ kernel for name, kernel in params["character"].items()}
+    rows = jnp.concatenate([scales["inputs"], jnp.ones(len(constants))])[:, None]
+
+    def scaled(name: str, layer: dict) -> dict:
+        return layer | {"kernel": layer["kernel"] * scales[name][None] if name in scales else layer["kernel"]}
+
+    layers = {name: scaled(name, layer) for name, layer in params["mlp"].items()}
+    layers["dense_0"] |= {"kernel": rows * layers["dense_0"]["kernel"]}
+    linear = scaled("linear", params["linear"])
+    return {"mlp": layers, "linear": linear | {"kernel": rows * linear["kernel"]}}
 
 
 def next_code(
@@ -157,8 +196,10 @@ def next_code(
     """Return the next code [L] of a Psi with forces, not yet clipped to its range; arguments as of `force_inputs`.
 
     Args:
+        params: of all characters, or `of_character`.
         share: of the code's change, which is taken.
     """
     inputs = scaled_inputs(scales, force_inputs(code, change, forces, constants, scales.whitening))
-    moved = scales.output * mlp.apply(ForcePsi(config, len(code)), params, inputs)
+    network = ForcePsi(config, len(code), len(constants) if "character" in params else 0)
+    moved = scales.output * mlp.apply(network, params, inputs)
     return code + share * jnp.matmul(moved, scales.whitening.back, precision="highest")

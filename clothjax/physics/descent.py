@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from clothjax.types import Array
 
 COLUMNS = 32  # columns of a Hessian that are computed together
-MEMORY = 16  # steps from which the curvature is known
+MEMORY = 32  # steps from which the curvature is known
 SUFFICIENT = 1e-4  # share of what the slope promises that a step must gain (Armijo)
 SHORTER = (0.1, 0.5)  # least and greatest share of a step that is tried after one that gained too little
 SCALE = (0.05, 20.0)  # least and greatest scale of the preconditioner, of the curvature of the last step

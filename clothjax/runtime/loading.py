@@ -124,6 +124,7 @@ def _arrays(
         cloth = Cloth(constants, areas * material.density, rest, material, shaped, mobility, None)
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
+        predictor = psi.of_character(predictor, psi.scaled_inputs(normalizers, constants))
         parts = ForcePredictor(predictor, normalizers, mesh, touched.faces, clusters, weights, corrections, None)
         bounds = Bounds(normalizers.low, normalizers.high, FORCE_SLACK * (normalizers.high - normalizers.low))
         first = jnp.zeros(len(normalizers.low))

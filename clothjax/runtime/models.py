@@ -79,7 +79,7 @@ class Felt(NamedTuple):
 class ForcePredictor(NamedTuple):
     """The latent predictor of a Psi with forces, and the geometry on which it feels them."""
 
-    params: dict  # of `psi.ForcePsi`
+    params: dict  # of `psi.of_character`
     scales: ForceScales
     mesh: Mesh  # of the garment's elements
     faces: Array  # [F, 3] int32 of the part of the body that can be touched

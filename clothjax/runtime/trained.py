@@ -1,9 +1,9 @@
 """Trained models: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
 A packed model is a folder with `model.npz` and `config.yaml`; a `report.json` may say how it was trained. Large
-matrices are stored in eight bits with a scale for each column (`NAME` and `NAME|scale`). The blend shapes and the
-preconditioner are in half precision, all else as it is. The whitening of a Psi with forces is the preconditioner's
-root, which needs all of its bits.
+matrices are stored in eight bits with a scale for each column (`NAME` and `NAME|scale`). The blend shapes, the
+preconditioner and the matrices of a Psi with forces are in half precision, all else as it is. The whitening of a Psi
+with forces is the preconditioner's root, which needs all of its bits.
 """
 
 import json
@@ -148,7 +148,7 @@ def pack(run: str | Path, out: str | Path) -> int:
     for stage in STAGES:
         wanted = getattr(config, stage).steps
         if stage == "stage2" and config.stage2.forces:
-            wanted = config.labels.rounds * config.labels.steps
+            wanted = config.labels.all_steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
         if done != wanted:
             raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
@@ -187,6 +187,8 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
             pass
         elif name in HALVED:
             leaf = leaf.astype(np.float16)
+        elif leaf.ndim > 1 and leaf.size > LARGE and exact and name.startswith("predictor/"):
+            leaf = leaf.astype(np.float16)  # in eight bits its cloth swings less
         elif leaf.ndim > 1 and leaf.size > LARGE:
             scale = np.maximum(np.abs(leaf).max(axis=tuple(range(leaf.ndim - 1))) / 127, 1e-20).astype(np.float32)
             arrays[f"{name}|scale"] = scale

@@ -21,7 +21,8 @@ from clothjax.types import Array
 
 SMALL = 0.3  # of the mean square of an ordinary change; frames that change less weigh no more
 WIDER = 0.1  # of the range of the labels' codes, which Psi may go beyond at either end
-SETTLING = 0.35  # share of the training steps, the last ones, in which the learning rate falls
+SETTLING = 0.35  # share of the training steps of all rounds, the last ones, in which the learning rate falls, ...
+LAST_SETTLING = 0.6  # ... and of those on all frames
 
 
 class Data(NamedTuple):
@@ -56,7 +57,7 @@ def blank(garment: dict, whitening: Whitening, constants: int, config: Config) -
     latent = len(whitening.to)
     size = (2 + len(KINDS)) * latent + constants
     key, model_key = jax.random.split(jax.random.key(config.labels.seed))
-    params = mlp.init(ForcePsi(config.stage2, latent), model_key, jnp.zeros(size))
+    params = mlp.init(ForcePsi(config.stage2, latent, constants), model_key, jnp.zeros(size))
     params = params | {"linear": jax.tree.map(jnp.zeros_like, params["linear"])}
     far = jnp.full(latent, 1e6)
     whitening = jax.tree.map(jnp.array, whitening)
@@ -145,31 +146,47 @@ def weight(targets: Array) -> Array:
     return 1.0 / (SMALL + (targets**2).mean(axis=-1))
 
 
-def optimizer(config: Config) -> optax.GradientTransformation:
-    """Build AdamW, whose rate stays and then falls to zero along a line, over the last `SETTLING` of all rounds."""
+def optimizer(config: Config, last: bool = False) -> optax.GradientTransformation:
+    """Build AdamW, whose rate stays and then falls along a line to zero: at the end of all rounds, or of the `last`."""
     settings = config.labels
-    steps = settings.rounds * settings.steps
+    steps, settling = settings.rounds * settings.steps, SETTLING
+    if last:
+        steps, settling = settings.last_steps, LAST_SETTLING
 
     def rate(step):
-        return settings.learning_rate * jnp.clip((1.0 - step / steps) / SETTLING, 0.0, 1.0)
+        return settings.learning_rate * jnp.clip((1.0 - step / steps) / settling, 0.0, 1.0)
 
     return optax.adamw(rate, weight_decay=settings.decay)
 
 
+def anew(state: TrainingState, network: ForcePsi, config: Config) -> TrainingState:
+    """Return the state before the last training: the linear map stays, all else is drawn anew.
+
+    A network that learnt the frames of the first rounds first, and longest, generalises worse (Ash & Adams 2020).
+    """
+    key = jax.random.fold_in(state.key, state.step)
+    params = mlp.init(network, key, jnp.zeros(len(state.normalizers.middle))) | {"linear": state.average["linear"]}
+    return state._replace(params=params, average=params, optimizer=optimizer(config, last=True).init(params))
+
+
 def make_update(
-    latent: int, config: Config, steps: int, device_mesh: Mesh | None = None
+    latent: int, constants: int, config: Config, steps: int, device_mesh: Mesh | None = None, last: bool = False
 ) -> Callable[[Data, TrainingState], tuple[TrainingState, dict[str, Array]]]:
     """Return a jitted function that takes `steps` training steps on data; it returns their metrics [steps] too.
 
     The loss is the squared error of the whitened change, relative to its size. The function consumes the state.
 
     Args:
-        latent: L.
+        latent, constants: L and C.
+        last: the training on all frames, which begins `anew` after the last round.
     """
-    settings, transform = config.labels, optimizer(config)
-    network = ForcePsi(config.stage2, latent)
+    settings, transform = config.labels, optimizer(config, last)
+    network = ForcePsi(config.stage2, latent, constants)
 
     def train_step(data: Data, state: TrainingState):
+        if last:
+            begins = state.step == settings.rounds * settings.steps
+            state = jax.lax.cond(begins, lambda before: anew(before, network, config), lambda same: same, state)
         key = jax.random.fold_in(state.key, state.step)
         rows = jax.random.randint(key, (settings.batch,), 0, data.count)
         inputs, targets = data.inputs[rows], data.targets[rows]

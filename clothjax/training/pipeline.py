@@ -195,14 +195,14 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     constants = constant_inputs(betas, configured_material(config), config.material)
     done = max(run.steps("stage2"), default=0)
     progress.say(f"stage 2: the latent predictor with forces, {settings.rounds} rounds of {settings.steps} steps")
-    if run.steps("tuning") and done < settings.rounds * settings.steps:
+    if run.steps("tuning") and done < settings.all_steps:
         raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
     settings_read = {
         name: value for name, value in configuration.to_dict(config).items() if name not in MAY_DIFFER["stage2"]
     }
     of = labels.fingerprint(settings_read, params)
     collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
-    update = imitation.make_update(len(inverse), config, STEPS_PER_CALL, run.device_mesh)
+    update = imitation.make_update(len(inverse), len(constants), config, STEPS_PER_CALL, run.device_mesh)
     state = imitation.blank(garment, whitening, len(constants), config)
     fitted, data, scales = loop.Fitted(state, 0.0, 0.0), None, state.normalizers
     simulations = labels.begin(scene, run.clips, config)
@@ -226,6 +226,11 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
             now = partial(update, devices.replicate(data, run.device_mesh))
             fitted = _fit(run, "stage2", now, state, end, f"stage 2, {config.garment}")
             state = fitted.state
+    if settings.last_steps > 0 and data is not None:
+        progress.say(f"stage 2: {settings.last_steps} steps on all frames, by a network drawn anew")
+        update = imitation.make_update(len(inverse), len(constants), config, STEPS_PER_CALL, run.device_mesh, last=True)
+        now = partial(update, devices.replicate(data, run.device_mesh))
+        fitted = _fit(run, "stage2", now, state, settings.all_steps, f"stage 2, {config.garment}")
     return fitted, _add_seconds(run, teacher_seconds=0.0)
 
 

@@ -123,7 +123,8 @@ def test_shipped_garments_have_the_names_and_shapes_of_the_modules(name):
     if isinstance(normalizers, ForceScales):
         code = len(normalizers.whitening.to)
         seen = jnp.zeros(len(normalizers.middle))
-        psi = jax.eval_shape(ForcePsi(config.stage2, code).init, jax.random.key(0), seen)
+        constants = len(predictor["character"]["linear"]) if "character" in predictor else 0
+        psi = jax.eval_shape(ForcePsi(config.stage2, code, constants).init, jax.random.key(0), seen)
         assert jax.tree.map(jnp.shape, predictor) == jax.tree.map(jnp.shape, psi["params"])
         return
     code, pose = (len(part.mean) for part in normalizers)

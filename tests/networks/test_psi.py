@@ -7,8 +7,8 @@ import pytest
 from toy import small
 
 from clothjax.body import motion_clips, skinning
-from clothjax.config import Config, MaterialConfig
-from clothjax.networks import decoder, normalisation, psi
+from clothjax.config import Config, MaterialConfig, Stage2Config
+from clothjax.networks import decoder, mlp, normalisation, psi
 from clothjax.networks.psi import Psi
 from clothjax.simulation import assembly
 from clothjax.training import stage2
@@ -202,3 +202,35 @@ def test_a_widened_range_holds_what_was_seen_since():
     assert ((wide.low <= row + 1e-6) & (row <= wide.high + 1e-6)).all()
     np.testing.assert_array_equal(wide.mean, scale.mean)
     assert wide.low[0] == scale.low[0] and wide.high[2] == scale.high[2] and wide.high[1] == scale.high[1]
+
+
+def test_the_network_of_one_character_is_that_of_all_at_its_constants():
+    """Each input and each output of a layer is scaled on its own."""
+    rng = np.random.default_rng(0)
+    constants, inputs = rng.normal(size=3).astype(np.float32), rng.normal(size=(5, 17)).astype(np.float32)
+    inputs[:, 14:] = constants
+    network = psi.ForcePsi(Stage2Config(hidden=(8, 6)), 4, 3)
+    params = mlp.init(network, jax.random.key(0), jnp.zeros(17))
+    plain = {name: layer for name, layer in params.items() if name != "character"}
+    for_one = psi.ForcePsi(Stage2Config(hidden=(8, 6)), 4)
+    np.testing.assert_allclose(mlp.apply(network, params, inputs), mlp.apply(for_one, plain, inputs), rtol=1e-5)
+    assert psi.of_character(plain, jnp.asarray(constants)) is plain
+    scales = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), params["character"])
+    assert {name: x.shape for name, x in scales.items()} == {
+        "inputs": (3, 14), "linear": (3, 4), "dense_0": (3, 8), "dense_1": (3, 6)
+    }  # fmt: skip
+    layers = [np.array(plain["mlp"][f"dense_{i}"]["kernel"]) for i in range(3)]
+    factors = {name: 1 + constants @ np.asarray(x) for name, x in scales.items()}
+    seen = np.concatenate([inputs[:, :14] * factors["inputs"], inputs[:, 14:]], axis=1)
+    x = np.maximum((seen @ layers[0]) * factors["dense_0"], 0)
+    x = np.maximum((x @ layers[1]) * factors["dense_1"], 0) @ layers[2]
+    expected = x + (seen @ np.asarray(plain["linear"]["kernel"])) * factors["linear"]  # biases are zero at first
+    all_of_it = params | {"character": scales}
+    np.testing.assert_allclose(mlp.apply(network, all_of_it, inputs), expected, rtol=1e-4, atol=1e-4)
+    one = psi.of_character(all_of_it, jnp.asarray(constants))
+    np.testing.assert_allclose(mlp.apply(for_one, one, inputs), expected, rtol=1e-4, atol=1e-4)
+    biased = {"mlp": plain["mlp"] | {"dense_0": plain["mlp"]["dense_0"] | {"bias": jnp.ones(8)}}}
+    one = psi.of_character(all_of_it | biased, jnp.asarray(constants))
+    np.testing.assert_array_equal(one["mlp"]["dense_0"]["bias"], 1.0)
+    found = mlp.apply(network, all_of_it | biased, inputs)
+    np.testing.assert_allclose(mlp.apply(for_one, one, inputs), found, rtol=1e-4, atol=1e-4)

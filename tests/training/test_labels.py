@@ -384,6 +384,31 @@ def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
     np.testing.assert_allclose(fitted, targets, atol=0.02)
 
 
+def test_the_last_training_keeps_the_linear_map_and_draws_all_else_anew(toy, round_of):
+    """It begins once, after the rounds, at the full rate."""
+    experiment, *_, blank = toy
+    settings = dataclasses.replace(experiment.config.labels, rounds=1, steps=2, last_steps=2, ridge=1e3)
+    config = dataclasses.replace(experiment.config, labels=settings)
+    first = imitation.first(blank, round_of, config)
+    data = imitation.extended(imitation.room(round_of, first.normalizers, config), round_of, first.normalizers)
+    take = partial(imitation.make_update, len(first.normalizers.low), 14, config, 1)
+    steps = [jax.tree.map(jnp.array, first)]
+    for number in range(4):
+        state, _ = take(last=number >= 2)(data, jax.tree.map(jnp.array, steps[-1]))
+        steps.append(jax.tree.map(jnp.array, state))
+    assert [int(state.step) for state in steps] == [0, 1, 2, 3, 4]
+
+    def moved(a, b, name):
+        leaves = zip(jax.tree.leaves(a.params[name]), jax.tree.leaves(b.params[name]), strict=True)
+        return max(float(jnp.abs(x - y).max()) for x, y in leaves)
+
+    rate = settings.learning_rate
+    kept = steps[2]._replace(params=steps[2].average)  # the linear map that the last training begins with
+    assert moved(kept, steps[3], "linear") < 1.5 * rate  # a step of Adam
+    assert moved(steps[1], steps[0], "mlp") < 1.5 * rate and moved(steps[2], steps[3], "mlp") > 100 * rate
+    assert 0 < moved(steps[3], steps[4], "mlp") < 1.5 * rate
+
+
 @pytest.mark.slow
 def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of):
     """The code that a rollout stores is the one that labelling counts as Psi's."""
@@ -409,11 +434,16 @@ def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of)
 
 @pytest.mark.slow
 def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(toy, tmp_path, monkeypatch):
-    config = dataclasses.replace(toy[0].config, stage1=dataclasses.replace(toy[0].config.stage1, steps=20))
+    config = toy[0].config
+    config = dataclasses.replace(
+        config,
+        stage1=dataclasses.replace(config.stage1, steps=20),
+        labels=dataclasses.replace(config.labels, last_steps=40),
+    )
     whole = pipeline.prepare(config, tmp_path / "whole")
     first = pipeline.train_phi(whole)
     straight, _ = pipeline.train_force_psi(whole, first)
-    assert int(straight.state.step) == 40
+    assert int(straight.state.step) == 80
     stopped = whole._replace(directory=tmp_path / "stopped")
     first = pipeline.train_phi(stopped)
     make_collect = labels.make_collect
@@ -432,6 +462,22 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
     with pytest.raises(KeyboardInterrupt):
         pipeline.train_force_psi(stopped, first)
     monkeypatch.setattr(labels, "make_collect", make_collect)
+    make_update = imitation.make_update
+
+    def ending(*arguments, last=False):
+        update = make_update(*arguments, last=last)
+
+        def once(data, state):
+            if last and int(state.step) == 60:  # in the midst of the training on all frames
+                raise KeyboardInterrupt
+            return update(data, state)
+
+        return once
+
+    monkeypatch.setattr(imitation, "make_update", ending)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.train_force_psi(stopped, first)
+    monkeypatch.setattr(imitation, "make_update", make_update)
     resumed, _ = pipeline.train_force_psi(stopped, first)
     monkeypatch.setattr(labels, "make_collect", stopping)  # a finished one is read
     assert_same(resumed.state.params, pipeline.train_force_psi(stopped, first)[0].state.params)
