@@ -370,6 +370,8 @@ class LabelsConfig:
     of gravity in a round. 0: none of these."""
     steps: int = 500
     """Training steps of a round."""
+    anew: bool = False
+    """Each round begins with the ridge solution of all frames so far, for few frames and steps."""
     last_steps: int = 0
     """Training steps on all frames after the last round, by a network drawn anew. 0: none."""
     batch: int = 256
@@ -377,7 +379,7 @@ class LabelsConfig:
     decay: float = 0.05
     """Weight decay."""
     ridge: float = 300.0
-    """Of the linear map's first value."""
+    """Penalty on the linear map that training begins with."""
     seed: int = 0
 
     RETIRED: ClassVar[dict[str, Any]] = {"candidates": ANYTHING, "candidate_rollouts": ANYTHING}

@@ -67,17 +67,9 @@ def blank(garment: dict, whitening: Whitening, constants: int, config: Config) -
     return TrainingState(jnp.int32(0), key, params, average, optimizer(config).init(params), scales, garment)
 
 
-def first(state: TrainingState, labels: Labels, config: Config) -> TrainingState:
-    """Return the state before the first training step: scales measured on the labels, the linear map by ridge."""
-    scales = measure(labels, state.normalizers.whitening)
-    inputs, targets = (np.asarray(part, np.float64) for part in examples(labels, scales))
-    weights = weight(targets)[:, None]
-    bordered = np.concatenate([inputs, np.ones((len(inputs), 1))], axis=1)
-    penalty = np.diag([config.labels.ridge] * inputs.shape[1] + [1e-3])
-    solution = np.linalg.solve((weights * bordered).T @ bordered + penalty, (weights * bordered).T @ targets)
-    linear = {"kernel": jnp.asarray(solution[:-1], jnp.float32), "bias": jnp.asarray(solution[-1], jnp.float32)}
-    params = state.params | {"linear": linear}
-    return state._replace(params=params, average=jax.tree.map(jnp.array, params), normalizers=scales)
+def first(state: TrainingState, labels: Labels) -> TrainingState:
+    """Return the state before the first training step: scales measured on the labels."""
+    return state._replace(normalizers=measure(labels, state.normalizers.whitening))
 
 
 def measure(labels: Labels, whitening: Whitening) -> ForceScales:
@@ -159,14 +151,36 @@ def optimizer(config: Config, last: bool = False) -> optax.GradientTransformatio
     return optax.adamw(rate, weight_decay=settings.decay)
 
 
-def anew(state: TrainingState, network: ForcePsi, config: Config) -> TrainingState:
-    """Return the state before the last training: the linear map stays, all else is drawn anew.
+def anew(state: TrainingState, data: Data, network: ForcePsi, config: Config, last: bool) -> TrainingState:
+    """Return the state from which frames are learnt: the linear map is their ridge solution, all else drawn anew.
 
     A network that learnt the frames of the first rounds first, and longest, generalises worse (Ash & Adams 2020).
     """
     key = jax.random.fold_in(state.key, state.step)
-    params = mlp.init(network, key, jnp.zeros(len(state.normalizers.middle))) | {"linear": state.average["linear"]}
-    return state._replace(params=params, average=params, optimizer=optimizer(config, last=True).init(params))
+    params = mlp.init(network, key, jnp.zeros(len(state.normalizers.middle))) | {"linear": ridge(data, config)}
+    return state._replace(params=params, average=params, optimizer=optimizer(config, last).init(params))
+
+
+def ridge(data: Data, config: Config) -> dict[str, Array]:
+    """Solve ridge regression on the frames that are there, with the weights of the loss."""
+    rounds, count = config.labels.rounds, len(data.inputs)
+    there = (jnp.arange(count) < data.count).astype(jnp.float32)[:, None]
+    rows = jax.tree.map(lambda x: x.reshape(rounds, count // rounds, -1), (data.inputs, data.targets, there))
+
+    def add(sums: tuple[Array, Array], row: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        inputs, targets, there = row
+        bordered = jnp.concatenate([inputs, there], axis=1)
+        weighted = bordered * (there[:, 0] * weight(targets))[:, None]
+        new = (jnp.matmul(weighted.T, x, precision="highest") for x in (bordered, targets))
+        return tuple(total + each for total, each in zip(sums, new, strict=True)), None
+
+    size = data.inputs.shape[1]
+    (squares, products), _ = jax.lax.scan(
+        add, (jnp.zeros((size + 1, size + 1)), jnp.zeros((size + 1, data.targets.shape[1]))), rows
+    )
+    penalty = jnp.full(size + 1, config.labels.ridge).at[-1].set(1e-3)
+    solution = jax.scipy.linalg.solve(squares + jnp.diag(penalty), products, assume_a="pos")
+    return {"kernel": solution[:-1], "bias": solution[-1]}
 
 
 def make_update(
@@ -178,15 +192,17 @@ def make_update(
 
     Args:
         latent, constants: L and C.
-        last: the training on all frames, which begins `anew` after the last round.
+        last: the training on all frames, after the last round.
     """
     settings, transform = config.labels, optimizer(config, last)
     network = ForcePsi(config.stage2, latent, constants)
+    begin = settings.rounds * settings.steps if last else 0
 
     def train_step(data: Data, state: TrainingState):
-        if last:
-            begins = state.step == settings.rounds * settings.steps
-            state = jax.lax.cond(begins, lambda before: anew(before, network, config), lambda same: same, state)
+        of_round = (state.step - begin) % settings.steps if settings.anew and not last else state.step - begin
+        state = jax.lax.cond(
+            of_round == 0, lambda before: anew(before, data, network, config, last), lambda same: same, state
+        )
         key = jax.random.fold_in(state.key, state.step)
         rows = jax.random.randint(key, (settings.batch,), 0, data.count)
         inputs, targets = data.inputs[rows], data.targets[rows]

@@ -217,7 +217,7 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
             labels.save(finished, path, of)
         simulations = finished.simulations
         if data is None:
-            state = imitation.first(state, finished.labels, config)
+            state = imitation.first(state, finished.labels)
             scales = jax.tree.map(jnp.array, state.normalizers)  # training consumes the state
             data = imitation.room(finished.labels, scales, config)
         data = imitation.extended(data, finished.labels, scales)

@@ -16,6 +16,7 @@ from clothjax.geometry.clusters import nearest_in_clusters
 from clothjax.geometry.proximity import nearest_point
 from clothjax.material import material_inputs
 from clothjax.networks import animators, forces, phi
+from clothjax.networks.psi import ForcePsi
 from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import inference, loading, trained
@@ -346,7 +347,7 @@ def test_labels_of_something_else_and_damaged_ones_are_refused(toy, finished, tm
 
 def test_frames_of_several_rounds_are_learnt_from_and_widen_the_range_of_codes(toy, round_of):
     config = toy[0].config
-    state = imitation.first(toy[3], round_of, config)
+    state = imitation.first(toy[3], round_of)
     other = round_of._replace(target=round_of.target + 1.0)
     data = imitation.room(round_of, state.normalizers, config)
     assert int(data.count) == 0
@@ -370,50 +371,70 @@ def test_examples_say_where_the_labels_go(toy, round_of):
     np.testing.assert_allclose(reached, round_of.target, atol=1e-3 * np.abs(round_of.target).max())
 
 
-def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
-    """With hardly any ridge and fewer frames than inputs, it fits every frame."""
+def learning(toy, round_of, **settings):
+    """The configuration, the state that has not learnt yet, and the data of two rounds, of which one is there."""
     experiment, *_, blank = toy
-    config = dataclasses.replace(
-        experiment.config,
-        labels=dataclasses.replace(experiment.config.labels, ridge=1e-6),
-        stage2=experiment.config.stage2,
-    )
-    state = imitation.first(blank, round_of, config)
-    inputs, targets = imitation.examples(round_of, state.normalizers)
-    fitted = inputs @ np.asarray(state.params["linear"]["kernel"]) + np.asarray(state.params["linear"]["bias"])
-    np.testing.assert_allclose(fitted, targets, atol=0.02)
-
-
-def test_the_last_training_keeps_the_linear_map_and_draws_all_else_anew(toy, round_of):
-    """It begins once, after the rounds, at the full rate."""
-    experiment, *_, blank = toy
-    settings = dataclasses.replace(experiment.config.labels, rounds=1, steps=2, last_steps=2, ridge=1e3)
+    settings = dataclasses.replace(experiment.config.labels, **settings)
     config = dataclasses.replace(experiment.config, labels=settings)
-    first = imitation.first(blank, round_of, config)
-    data = imitation.extended(imitation.room(round_of, first.normalizers, config), round_of, first.normalizers)
-    take = partial(imitation.make_update, len(first.normalizers.low), 14, config, 1)
-    steps = [jax.tree.map(jnp.array, first)]
-    for number in range(4):
-        state, _ = take(last=number >= 2)(data, jax.tree.map(jnp.array, steps[-1]))
-        steps.append(jax.tree.map(jnp.array, state))
-    assert [int(state.step) for state in steps] == [0, 1, 2, 3, 4]
+    state = imitation.first(blank, round_of)
+    data = imitation.room(round_of, state.normalizers, config)
+    return config, state, imitation.extended(data, round_of, state.normalizers)
 
-    def moved(a, b, name):
-        leaves = zip(jax.tree.leaves(a.params[name]), jax.tree.leaves(b.params[name]), strict=True)
-        return max(float(jnp.abs(x - y).max()) for x, y in leaves)
 
-    rate = settings.learning_rate
-    kept = steps[2]._replace(params=steps[2].average)  # the linear map that the last training begins with
-    assert moved(kept, steps[3], "linear") < 1.5 * rate  # a step of Adam
-    assert moved(steps[1], steps[0], "mlp") < 1.5 * rate and moved(steps[2], steps[3], "mlp") > 100 * rate
-    assert 0 < moved(steps[3], steps[4], "mlp") < 1.5 * rate
+def begun(toy, round_of):
+    """The state that has learnt a round by ridge regression alone."""
+    config, state, data = learning(toy, round_of)
+    network = ForcePsi(config.stage2, len(state.normalizers.low), 14)
+    return imitation.anew(state, data, network, config, last=False)
+
+
+def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
+    """In a second implementation it minimises the weighted squared error of the frames that are there."""
+    _, state, data = learning(toy, round_of)
+    found = begun(toy, round_of).params["linear"]
+    inputs, targets = (np.asarray(x, np.float64) for x in imitation.examples(round_of, state.normalizers))
+    root = np.sqrt(1 / (imitation.SMALL + (targets**2).mean(axis=1)))[:, None]
+    size = inputs.shape[1]
+    penalty = np.diag(np.sqrt([toy[0].config.labels.ridge] * size + [1e-3]))
+    rows = np.concatenate([root * np.append(inputs, np.ones((len(inputs), 1)), axis=1), penalty])
+    expected = np.linalg.lstsq(rows, np.concatenate([root * targets, np.zeros((size + 1, targets.shape[1]))]))[0]
+    atol = 1e-3 * np.abs(expected).max()
+    np.testing.assert_allclose(found["kernel"], expected[:-1], atol=atol)
+    np.testing.assert_allclose(found["bias"], expected[-1], atol=atol)
+    assert int(data.count) == len(inputs) < len(data.inputs)
+
+
+def moved(a, b, name):
+    """How far a part of the parameters moved, at most."""
+    leaves = zip(jax.tree.leaves(a.params[name]), jax.tree.leaves(b.params[name]), strict=True)
+    return max(float(jnp.abs(x - y).max()) for x, y in leaves)
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_training_begins_anew_at_the_ridge_solution_where_it_is_to(toy, round_of, anew):
+    """It always does before the first step and before the last training, in between if `anew`; then it goes on."""
+    config, state, data = learning(toy, round_of, steps=2, last_steps=2, anew=anew)
+    solved, rate = begun(toy, round_of), config.labels.learning_rate
+    take = partial(imitation.make_update, len(state.normalizers.low), 14, config, 1)
+    rounds, last = take(), take(last=True)
+    states = [state]
+    for number in range(6):  # two rounds of two steps, then the last two
+        states.append((rounds if number < 4 else last)(data, jax.tree.map(jnp.array, states[-1]))[0])
+        states[-1] = jax.tree.map(jnp.array, states[-1])
+    assert [int(each.step) for each in states] == list(range(7))
+    for number in range(1, 7):
+        from_ridge = moved(solved, states[number], "linear")
+        begins = number in (1, 5) or (anew and number == 3)
+        assert (from_ridge < 1.5 * rate) == begins, number  # a step of Adam
+        drawn = moved(states[number - 1], states[number], "mlp")
+        assert (drawn > 20 * rate) == begins, number
 
 
 @pytest.mark.slow
 def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of):
     """The code that a rollout stores is the one that labelling counts as Psi's."""
-    experiment, clips, params, blank = toy
-    state = imitation.first(blank, round_of, experiment.config)
+    experiment, clips, params, _ = toy
+    state = begun(toy, round_of)
     new = collected(toy, collect, state, seed=5).labels
     assert (new.predicted != new.held).all()
     scene, config = experiment.scene, experiment.config
