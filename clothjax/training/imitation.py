@@ -171,8 +171,8 @@ def ridge(data: Data, config: Config) -> dict[str, Array]:
         inputs, targets, there = row
         bordered = jnp.concatenate([inputs, there], axis=1)
         weighted = bordered * (there[:, 0] * weight(targets))[:, None]
-        new = (jnp.matmul(weighted.T, x, precision="highest") for x in (bordered, targets))
-        return tuple(total + each for total, each in zip(sums, new, strict=True)), None
+        squares, products = (jnp.matmul(weighted.T, x, precision="highest") for x in (bordered, targets))
+        return (sums[0] + squares, sums[1] + products), None
 
     size = data.inputs.shape[1]
     (squares, products), _ = jax.lax.scan(

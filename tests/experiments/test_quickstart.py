@@ -19,7 +19,7 @@ def test_the_quickstart_meets_its_bars(report):
     assert report["quickstart"]["train_seconds"] <= 600
     assert phi["energy_gap"] <= 0.03
     assert phi["hold_gap"] <= 0.90
-    assert psi["energy_gap"] <= 0.06
+    assert psi["energy_gap"] <= 0.06 and psi["hold_gap"] <= 0.6 and psi["swing_ratio"] >= 0.7
     assert psi["penetration_percent"] <= 1.0
     assert psi["finite"] is True
     assert report["quickstart"]["onnx_error_mm"] <= 0.1
