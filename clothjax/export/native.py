@@ -167,7 +167,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     kernel = np.concatenate([first.kernel, linear["kernel"]], axis=1).astype(np.float64)
     constants = np.asarray(psi.scaled_inputs(scales, cloth.constants))
     bias = np.concatenate([first.bias, linear["bias"]]) + constants @ kernel[inputs:]
-    yield from _layer(Layer(kernel[:inputs], bias), gains=True)
+    yield from _layer(Layer(kernel[:inputs], bias))
     yield from _exact(np.asarray(scales.output) * back)
     if predictor.felt is not None:
         yield from _layer(Layer(felt.shapes, template.reshape(-1)), gains=True)

@@ -12,7 +12,7 @@ from clothjax.body import motion_clips, reach
 from clothjax.config import Config
 from clothjax.evaluation import metrics, pictures, rollouts
 from clothjax.evaluation import report as measures
-from clothjax.files import checkpoint
+from clothjax.files import checkpoint, configuration
 from clothjax.networks import normalisation
 from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
@@ -30,6 +30,7 @@ TOY = [
     "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
     "--labels.rounds", "2", "--labels.simulations", "2", "--labels.frames", "4", "--labels.descent-steps", "2",
+    "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
 
 
@@ -149,8 +150,11 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
 
 
 @pytest.mark.slow
-def test_a_packed_garment_is_tuned_on_other_motions(finished, tmp_path):
-    trained.pack(finished, tmp_path / "packed")
+def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
+    """One without forces: what it reads of the pose gets a wider range."""
+    without = ["--no-stage2.forces", "--model.relaxation", "0"]
+    pipeline.train(configuration.cli(Config, [quickstart.CONFIG, *TOY, *without]), tmp_path / "run")
+    trained.pack(tmp_path / "run", tmp_path / "packed")
     settings = ["--motions", "dance_3", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
     settings += ["--tuning.learning-rate", "1e-2", "--tuning.ema", "0.5"]  # so that 40 steps are seen
     report = tmp_path / "packed" / "report.json"
