@@ -65,7 +65,7 @@ QUICK_GARMENTS = ("tshirt",)
 QUICK = [  # what compiles soonest
     "configs/quickstart.yaml", "--model.body_nodes", "updated", "--model.width", "16",
     "--model.latent_update", "absolute", "--physics.contact_surface", "centroids", "--physics.no-edge_contact",
-    "--no-stage2.forces", "--model.relaxation", "0",
+    "--stage2.no-forces", "--model.relaxation", "0",
 ]  # fmt: skip
 
 

@@ -152,7 +152,7 @@ def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_ref
 @pytest.mark.slow
 def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
     """One without forces: what it reads of the pose gets a wider range."""
-    without = ["--no-stage2.forces", "--model.relaxation", "0"]
+    without = ["--stage2.no-forces", "--model.relaxation", "0"]
     pipeline.train(configuration.cli(Config, [quickstart.CONFIG, *TOY, *without]), tmp_path / "run")
     trained.pack(tmp_path / "run", tmp_path / "packed")
     settings = ["--motions", "dance_3", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
