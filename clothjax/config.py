@@ -330,7 +330,7 @@ class Stage2Config:
     hidden: tuple[int, ...] = (512, 512)
     forces: bool = False
     """Psi reads the forces on the held garment in place of the pose, and learns from `labels` in place of rollouts of
-    Phi. Fine-tuning then needs a tenth of the usual rate. A frame takes about four times as long."""
+    Phi. Fine-tuning then needs a tenth of the usual rate. A frame takes 8 to 48 times as long, by runtime."""
     learning_rate: float = 1e-3
     clip: float = 1.0
     sequences: int = 96

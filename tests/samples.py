@@ -352,8 +352,11 @@ class ForcePsi(NamedTuple):
         )
 
 
-def random_force_psi(skip=True, limit=5.0, relaxation=0, **physics):
-    """A random Psi with forces whose code decays, within +-`limit`, with either a skip or a ReLU on the weights."""
+def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, **physics):
+    """A random Psi with forces whose code decays, within +-`limit`, with either a skip or a ReLU on the weights.
+
+    The character scales its inputs and layers by random maps of size `scaled`; by default it does not.
+    """
     config = small()
     config = dataclasses.replace(
         config,
@@ -375,12 +378,17 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, **physics):
     mixed = rng.normal(size=(size, size))
     whitening = forces.whitening(0.01 * (mixed @ mixed.T / size + 0.1 * np.eye(size)))
     count = (2 + len(forces.KINDS)) * size + 14
-    network = psi.ForcePsi(config.stage2, size)
+    network = psi.ForcePsi(config.stage2, size, 14 if scaled > 0 else 0)
     predictor = mlp.init(network, jax.random.key(1), jnp.zeros(count))
     spread, output = np.repeat([1.0, 1.0, 0.02, 0.02, 3.0, 1.0], [size] * 5 + [14]), 0.3
     kernel = 0.3 * rng.normal(size=predictor["linear"]["kernel"].shape) / np.sqrt(count)
     kernel[:size] = -0.3 / output * whitening.to
     predictor["linear"] |= {"kernel": jnp.asarray(kernel, jnp.float32)}
+    if scaled > 0:
+        predictor["character"] = {
+            name: jnp.asarray(scaled * rng.normal(size=x.shape), jnp.float32)
+            for name, x in predictor["character"].items()
+        }
     predictor["mlp"]["dense_2"] |= {"kernel": 300 * predictor["mlp"]["dense_2"]["kernel"]}
     scales = ForceScales(
         *(jnp.asarray(x, jnp.float32) for x in (0.1 * rng.normal(size=count), spread, output)),

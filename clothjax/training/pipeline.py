@@ -226,7 +226,8 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
             now = partial(update, devices.replicate(data, run.device_mesh))
             fitted = _fit(run, "stage2", now, state, end, f"stage 2, {config.garment}")
             state = fitted.state
-    if settings.last_steps > 0 and data is not None:
+    if settings.last_steps > 0:
+        assert data is not None  # there is a round
         progress.say(f"stage 2: {settings.last_steps} steps on all frames, by a network drawn anew")
         update = imitation.make_update(len(inverse), len(constants), config, STEPS_PER_CALL, run.device_mesh, last=True)
         now = partial(update, devices.replicate(data, run.device_mesh))

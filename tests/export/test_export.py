@@ -292,6 +292,7 @@ def forced():
     return {
         "limp": random_force_psi(without=("bending", "gravity"), edge_contact=False).model(material=STIFF),
         "skip": skip.model(),
+        "scaled": random_force_psi(scaled=0.02).model(betas=np.ones(10)),
         "relu": relu.model(betas=np.ones(10)),
         "mesh": specialise.specialise(mesh),
         "few": few,
@@ -308,7 +309,7 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh"])
+@pytest.mark.parametrize("name", ["skip", "scaled", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh"])
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)

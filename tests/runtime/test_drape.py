@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 import clothjax as cj
 from clothjax.body import skinning
 from clothjax.evaluation import rollouts
+from clothjax.files import checkpoint, storage
 from clothjax.geometry.clusters import middles
 from clothjax.geometry.vectors import at_corners
 from clothjax.material import configured_material
@@ -347,3 +348,35 @@ def test_it_is_in_float32_in_a_process_that_is_not(forced, model, motion):
         found, _ = inference.animate(again, motion._replace(translation=motion.translation.astype(np.float64)))
         assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_a_model_has_the_network_of_its_character():
+    """It has no scales left, of which no export knows, and steps as with them; with another's it steps otherwise."""
+    it = random_force_psi(scaled=0.02)
+    model, clip = it.model(betas=np.ones(10)), storage.load_motion("walk_0")
+    predictor = model.network.predictor
+    assert set(predictor.params) == {"linear", "mlp"}
+    state = inference.initial_state(model, Pose(clip.rotations[0], clip.translation[0]))
+    pose = Pose(clip.rotations[1], clip.translation[1])
+
+    def stepped(params):
+        network = model.network._replace(predictor=predictor._replace(params=params))
+        return inference.step(dataclasses.replace(model, network=network), state, pose)[0].latent
+
+    ours, other = predictor.params, it.model(betas=-np.ones(10)).network.predictor.params
+    np.testing.assert_allclose(stepped(it.predictor), stepped(ours), atol=1e-4)
+    assert np.abs(stepped(other) - stepped(ours)).max() > 0.01
+
+
+def test_a_psi_with_forces_is_packed_in_half_precision(tmp_path):
+    it = random_force_psi(scaled=0.02)
+    statistics = normalisation.Statistics(*(np.zeros(1, np.float32) for _ in normalisation.Statistics._fields))
+    phi = {
+        "params": {"garment": it.garment, "inverse_hessian": np.eye(40, dtype=np.float32)},
+        "statistics": {"mesh": statistics},
+    }
+    trained.write(tmp_path, it.experiment.config, phi, it.predictor, it.scales)
+    found = trained.psi(tmp_path).predictor
+    for name, leaf in checkpoint.named(it.predictor).items():
+        error = np.abs(checkpoint.named(found)[name] - leaf).max()
+        assert error <= 1e-3 * np.abs(leaf).max(), name
