@@ -427,6 +427,7 @@ DOCUMENTS = (
 SMALL = (
     "--shapes.sequences 0 --model.descent_samples 0 --model.width 8 --model.blendshapes 24 --stage1.steps 20 "
     "--stage2.steps 20 --stage2.sequences 2 --stage2.frames 8 --stage2.rollout 2 --tuning.steps 20 --tuning.pool 2 "
+    "--labels.rounds 1 --labels.simulations 2 --labels.steps 20 --labels.last_steps 0 "
     "--evaluation.frames 30 "
     "--evaluation.gap_frames 1 --evaluation.solver_frames 20 --evaluation.long_frames 40"
 )

@@ -36,9 +36,11 @@ def shrink(config: Config) -> Config:
 
 
 def small() -> Config:
-    """The default experiment, shrunk, with two convolution blocks and one coarse level."""
+    """The default experiment without forces, shrunk, with two convolution blocks and one coarse level."""
+    default = Config()
+    model = dataclasses.replace(default.model, convolution=(Level(6), Level(6)))
     return shrink(
-        dataclasses.replace(Config(), model=dataclasses.replace(Config().model, convolution=(Level(6), Level(6))))
+        dataclasses.replace(default, model=model, stage2=dataclasses.replace(default.stage2, forces=False))
     )
 
 

@@ -73,7 +73,7 @@ def test_forces_need_a_moving_body_and_phis_descent(other, reason):
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ({"model": {"relaxation": 2}}, r"model\.relaxation needs stage2\.forces"),
+        ({"model": {"relaxation": 2}, "stage2": {"forces": False}}, r"model\.relaxation needs stage2\.forces"),
         ({"model": {"relaxation": 17}, "stage2": {"forces": True}}, "relaxation must be 0 to 16, got 17"),
         ({"model": {"relaxation": -1}, "stage2": {"forces": True}}, "relaxation must be 0 to 16, got -1"),
     ],

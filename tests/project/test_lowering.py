@@ -110,7 +110,7 @@ def test_training(compiled, kind, tmp_path):
         config = dataclasses.replace(
             config,
             model=dataclasses.replace(config.model, relaxation=2),
-            labels=LabelsConfig(rounds=2, simulations=2, frames=4, steps=20, batch=8),
+            labels=LabelsConfig(rounds=2, simulations=2, frames=4, steps=20, last_steps=0, batch=8),
             tuning=dataclasses.replace(config.tuning, steps=0),
         )
     pipeline.train(config, tmp_path)
