@@ -33,7 +33,9 @@ def toy():
         config,
         motions=("walk_0", "dance_0"),
         stage2=dataclasses.replace(config.stage2, forces=True),
-        labels=LabelsConfig(rounds=2, simulations=2, frames=5, external=0.0, noise=0.0, steps=20, last_steps=0, batch=8),
+        labels=LabelsConfig(
+            rounds=2, simulations=2, frames=5, external=0.0, noise=0.0, steps=20, last_steps=0, batch=8
+        ),
     )
     experiment = assembly.assemble(config)
     clips = jax.tree.map(jnp.asarray, assembly.training_clips(experiment)[0])
