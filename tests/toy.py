@@ -39,9 +39,7 @@ def small() -> Config:
     """The default experiment without forces, shrunk, with two convolution blocks and one coarse level."""
     default = Config()
     model = dataclasses.replace(default.model, convolution=(Level(6), Level(6)))
-    return shrink(
-        dataclasses.replace(default, model=model, stage2=dataclasses.replace(default.stage2, forces=False))
-    )
+    return shrink(dataclasses.replace(default, model=model, stage2=dataclasses.replace(default.stage2, forces=False)))
 
 
 def assert_same(one, other) -> None:
