@@ -96,12 +96,17 @@ def green_strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"])
     return jnp.stack([jnp.stack([along, shear], axis=1), jnp.stack([shear, across], axis=1)], axis=1)
 
 
-def _strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> tuple[Array, Array, Array]:
-    """Return the entries 11, 12 and 22 [F] of the Green strain: (F^T F - I) / 2."""
+def _deformed(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> tuple[vectors.Vector, vectors.Vector]:
+    """Return the columns of the deformation gradients of triangles, each a vector of components [F]."""
     a, b, c, d = inverse.reshape(-1, 4).T
     first, second, third = vectors.corners(corners)
     left, right = minus(first, third), minus(second, third)
-    along, across = plus(times(a, left), times(c, right)), plus(times(b, left), times(d, right))
+    return plus(times(a, left), times(c, right)), plus(times(b, left), times(d, right))
+
+
+def _strain(corners: Float[Array, "F 3 3"], inverse: Float[Array, "F 2 2"]) -> tuple[Array, Array, Array]:
+    """Return the entries 11, 12 and 22 [F] of the Green strain: (F^T F - I) / 2."""
+    along, across = _deformed(corners, inverse)
     return 0.5 * (dot(along, along) - 1.0), 0.5 * dot(along, across), 0.5 * (dot(across, across) - 1.0)
 
 
@@ -118,6 +123,37 @@ def stretching(
     trace = along + across
     squares = along * along + 2.0 * shear * shear + across * across
     return area * thickness * (mu * squares + 0.5 * lam * trace * trace)
+
+
+def stretching_hessian_product(
+    corners: Float[Array, "F 3 3"],
+    moves: Float[Array, "F 3 3"],
+    inverse: Float[Array, "F 2 2"],
+    area: Float[Array, " F"],
+    mu: Scalar | Float[Array, " F"],
+    lam: Scalar | Float[Array, " F"],
+    thickness: float = THICKNESS,
+) -> Float[Array, "F 3 3"]:
+    """Return the Hessians of `stretching` of triangles [F, 3, 3] m times moves [F, 3, 3] m of their corners, in N.
+
+    That is the derivative of the first Piola-Kirchhoff stress F S along the moves: dF S + F dS, with
+    S = 2 mu G + lambda tr(G) I, at the corners.
+    """
+
+    def stress(along: Array, shear: Array, across: Array) -> tuple[Array, Array, Array]:
+        trace = lam * (along + across)
+        scale = area * thickness
+        return scale * (2.0 * mu * along + trace), scale * 2.0 * mu * shear, scale * (2.0 * mu * across + trace)
+
+    (u, v), (du, dv) = _deformed(corners, inverse), _deformed(moves, inverse)
+    s, t, w = stress(*_strain(corners, inverse))
+    ds, dt, dw = stress(dot(u, du), 0.5 * (dot(u, dv) + dot(v, du)), dot(v, dv))
+    first = plus(plus(times(s, du), times(t, dv)), plus(times(ds, u), times(dt, v)))
+    second = plus(plus(times(t, du), times(w, dv)), plus(times(dt, u), times(dw, v)))
+    a, b, c, d = inverse.reshape(-1, 4).T
+    left, right = plus(times(a, first), times(b, second)), plus(times(c, first), times(d, second))
+    ends = (left, right, times(-1.0, plus(left, right)))
+    return jnp.stack([jnp.stack(end, axis=1) for end in ends], axis=1)
 
 
 def dihedral_angle(corners: Float[Array, "H 4 3"]) -> Float[Array, " H"]:

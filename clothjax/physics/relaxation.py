@@ -7,7 +7,7 @@ the code's.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from clothjax.geometry.vectors import at_corners
 from clothjax.physics import energies
@@ -15,6 +15,42 @@ from clothjax.types import Array, Material, Mesh, Rest
 
 RATE = 0.8  # of a Jacobi step; above 1.3 the shortest waves of a regular mesh grow
 LONGEST = 0.005  # m, that a vertex moves in a step at most: far out of shape the cloth is many times as stiff
+
+
+@jax.custom_vjp
+def stretching_gradient(
+    position: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    inverse: Float[Array, "F 2 2"],
+    area: Float[Array, " F"],
+    mu: Array,
+    lam: Array,
+) -> Float[Array, "V 3"]:
+    """Return the gradient [V, 3] N of the stretching energy by positions [V, 3] m; other arguments as of its energy.
+
+    Its own derivative by positions is in closed form, which takes XLA a quarter of the time of the general one.
+    """
+    return _gradient(position, faces, inverse, area, mu, lam)
+
+
+def _gradient(position: Array, faces: Array, *cloth: Array) -> Array:
+    return jax.grad(lambda x: jnp.sum(energies.stretching(at_corners(x, faces), *cloth)))(position)
+
+
+def _forward(*arguments: Array) -> tuple[Array, tuple[Array, ...]]:
+    return _gradient(*arguments), arguments
+
+
+def _backward(arguments: tuple[Array, ...], cotangent: Array) -> tuple[Array | None, ...]:
+    position, faces, *cloth = arguments
+    corners, pull = jax.vjp(lambda x: at_corners(x, faces), position)
+    # the Hessian is symmetric
+    (by_position,) = pull(energies.stretching_hessian_product(corners, at_corners(cotangent, faces), *cloth))
+    _, back = jax.vjp(lambda *cloth: _gradient(position, faces, *cloth), *cloth)
+    return by_position, None, *back(cotangent)
+
+
+stretching_gradient.defvjp(_forward, _backward)
 
 
 def mobility(rest: Rest, material: Material, mesh: Mesh, free: Float[Array, " V"]) -> Float[Array, " V"]:
@@ -48,12 +84,9 @@ def relaxed(
         mobility: [V] m/N, of `mobility`.
     """
 
-    def energy(x: Array) -> Array:
-        corners = at_corners(x, mesh.faces)
-        return jnp.sum(energies.stretching(corners, rest.inverse, rest.face_area, material.mu, material.lam))
-
+    cloth = (rest.inverse, rest.face_area, material.mu, material.lam)
     for _ in range(steps):
-        move = -mobility[:, None] * jax.grad(energy)(position)
+        move = -mobility[:, None] * stretching_gradient(position, mesh.faces, *cloth)
         length = jnp.sum(move * move, axis=-1, keepdims=True)
         position += move / jnp.sqrt(1.0 + length / LONGEST**2)
     return position

@@ -1,5 +1,7 @@
 """Relaxation: Jacobi steps down the stretching energy."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,3 +110,53 @@ def test_cloth_far_out_of_shape_moves_little_and_stays_finite(sheet):
         for steps in (1, 4):
             moved = jnp.linalg.norm(of(sheet, far, steps) - far, axis=1)
             assert jnp.isfinite(moved).all() and moved.max() <= steps * relaxation.LONGEST * (1 + 1e-3)
+
+
+def test_the_hessian_product_is_that_of_differentiation(sheet):
+    """In float64, for triangles far out of shape, and for cloth that differs from face to face."""
+    with jax.enable_x64():
+        rng = np.random.default_rng(2)
+        corners, moves = rng.normal(size=(2, 30, 3, 3))
+        inverse, area, mu, lam = rng.normal(size=(30, 2, 2)), *rng.uniform(0.5, 2.0, size=(3, 30))
+
+        def gradient(x):
+            return jax.grad(lambda x: jnp.sum(energies.stretching(x, inverse, area, mu, lam)))(x)
+
+        expected = jax.jvp(gradient, (jnp.asarray(corners),), (jnp.asarray(moves),))[1]
+        found = energies.stretching_hessian_product(corners, moves, inverse, area, mu, lam)
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-15)
+
+
+def test_derivatives_of_relaxation_are_those_of_its_formula(sheet):
+    """By positions, rest measures and cloth, in reverse mode and as the Hessian that conditions the descent."""
+    with jax.enable_x64():
+        wide = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if x.dtype == jnp.float32 else x, (*sheet, CLOTH))
+        vertices, mesh, rest, base = wide
+        rng = np.random.default_rng(1)
+        x, weights = vertices + 1e-3 * rng.normal(size=vertices.shape), rng.normal(size=vertices.shape)
+        mobility = relaxation.mobility(rest, base, mesh, jnp.ones(len(x)))
+
+        def plain(x, inverse, mu):
+            there, cloth = rest._replace(inverse=inverse), base._replace(mu=mu)
+            for _ in range(3):
+                move = -mobility[:, None] * jax.grad(lambda x: stretching(x, mesh, there, cloth))(x)
+                length = jnp.sum(move * move, axis=-1, keepdims=True)
+                x += move / jnp.sqrt(1.0 + length / relaxation.LONGEST**2)
+            return jnp.sum(weights * x * x)
+
+        def found(x, inverse, mu):
+            there, cloth = rest._replace(inverse=inverse), base._replace(mu=mu)
+            return jnp.sum(weights * relaxation.relaxed(x, mobility, there, cloth, mesh, 3) ** 2)
+
+        arguments = (x, rest.inverse, base.mu)
+        for one, other in zip(*(jax.grad(f, (0, 1, 2))(*arguments) for f in (plain, found)), strict=True):
+            np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-12 * np.abs(one).max())
+        direction = rng.normal(size=x.shape)
+        one, other = (
+            jax.jvp(jax.grad(partial(f, inverse=rest.inverse, mu=base.mu)), (x,), (direction,))[1]
+            for f in (plain, found)
+        )
+        np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-10 * np.abs(one).max())
+        several = jnp.stack([x, vertices])
+        each = jax.vmap(jax.grad(found), (0, None, None))(several, *arguments[1:])
+        np.testing.assert_allclose(each[0], jax.grad(found)(*arguments), rtol=1e-8, atol=1e-12)
