@@ -1,9 +1,9 @@
 """Trained models: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
 A packed model is a folder with `model.npz` and `config.yaml`; a `report.json` may say how it was trained. Large
-matrices are stored in eight bits with a scale for each column (`NAME` and `NAME|scale`). The blend shapes, the
-preconditioner and the matrices of a Psi with forces are in half precision, all else as it is. The whitening of a Psi
-with forces is the preconditioner's root, which needs all of its bits.
+arrays are stored in eight bits, with a scale for each run of `RUN` entries (`NAME` and `NAME|scale`). The
+preconditioner is in half precision, all else as it is. The whitening of a Psi with forces is the preconditioner's root,
+which needs all of its bits.
 """
 
 import json
@@ -24,9 +24,9 @@ MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
 HESSIAN = "phi/inverse_hessian"
-HALVED = ("phi/garment/blendshapes", HESSIAN)  # eight bits would strain the cloth, slow the descent
-FORMAT = 3  # of a packed model; earlier ones have arrays that are no longer used, and 1 has no number
-LARGE = 2000  # entries from which a matrix is stored in eight bits
+FORMAT = 4  # of a packed model; before 4 a scale is of a column, 2 has arrays that are no longer used, 1 no number
+LARGE = 2000  # entries from which an array is stored in eight bits
+RUN = 32  # consecutive entries that share a scale; a scale for each column would cost the cloth swing
 
 
 class TrainedPsi(NamedTuple):
@@ -168,10 +168,9 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         predictor: parameters of the latent predictor.
         normalizers: scales of its codes and inputs.
     """
-    exact, scales = None, normalizers._asdict()
+    scales = normalizers._asdict()
     if isinstance(normalizers, ForceScales):
         del scales["whitening"]  # of the inverse Hessian, which must then be exact
-        exact = HESSIAN
     else:
         scales = {name: each._asdict() for name, each in scales.items()}
     parts = {
@@ -183,16 +182,10 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
     arrays: dict[str, Any] = {"format": np.int32(FORMAT)}
     for name, leaf in checkpoint.named(parts).items():
         leaf = np.asarray(leaf)
-        if name == exact:
-            pass
-        elif name in HALVED:
-            leaf = leaf.astype(np.float16)
-        elif leaf.ndim > 1 and leaf.size > LARGE and exact and name.startswith("predictor/"):
-            leaf = leaf.astype(np.float16)  # in eight bits its cloth swings less
+        if name == HESSIAN:
+            leaf = leaf if isinstance(normalizers, ForceScales) else leaf.astype(np.float16)
         elif leaf.ndim > 1 and leaf.size > LARGE:
-            scale = np.maximum(np.abs(leaf).max(axis=tuple(range(leaf.ndim - 1))) / 127, 1e-20).astype(np.float32)
-            arrays[f"{name}|scale"] = scale
-            leaf = np.round(leaf / scale).astype(np.int8)
+            leaf, arrays[f"{name}|scale"] = _in_eight_bits(leaf)
         arrays[name] = leaf
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -206,6 +199,18 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
         for path in partial.values():
             path.unlink(missing_ok=True)
     return (out / WEIGHTS).stat().st_size
+
+
+def _in_eight_bits(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an array in eight bits, and the scale of each run of entries [N / RUN]."""
+    runs = np.pad(array.reshape(-1), (0, -array.size % RUN)).reshape(-1, RUN)
+    scale = np.maximum(np.abs(runs).max(axis=1) / 127, 1e-20).astype(np.float32)
+    return np.round(runs / scale[:, None]).astype(np.int8).reshape(-1)[: array.size].reshape(array.shape), scale
+
+
+def _from_eight_bits(array: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the float32 array of `_in_eight_bits`."""
+    return (array.reshape(-1) * np.repeat(scale, RUN)[: array.size]).astype(np.float32).reshape(array.shape)
 
 
 def _statistics(parts: dict[str, dict]) -> dict[str, Statistics]:
@@ -231,12 +236,16 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
     path = directory / WEIGHTS
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged one open
-            damage.refuse_newer(path, int(file["format"]) if "format" in file.files else 1, FORMAT)
+            number = int(file["format"]) if "format" in file.files else 1
+            damage.refuse_newer(path, number, FORMAT)
             names = [name for name in file.files if name != "format" and not name.endswith("|scale")]
             leaves = {name: file[name] for name in names}
             for name, leaf in leaves.items():
-                scale = file[f"{name}|scale"] if leaf.dtype == np.int8 else 1
-                leaves[name] = (leaf * scale).astype(np.float32)
+                if leaf.dtype == np.int8:
+                    scale = file[f"{name}|scale"]
+                    leaves[name] = _from_eight_bits(leaf, scale) if number > 3 else np.float32(leaf * scale)
+                else:
+                    leaves[name] = leaf.astype(np.float32)
         tree = checkpoint.nested(leaves)
         tree["phi"]["garment"]  # all else of a model needs it
         if config.stage2.forces:

@@ -368,15 +368,46 @@ def test_a_model_has_the_network_of_its_character():
     assert np.abs(stepped(other) - stepped(ours)).max() > 0.01
 
 
-def test_a_psi_with_forces_is_packed_in_half_precision(tmp_path):
+@pytest.fixture
+def packed(tmp_path):
+    """A random Psi with forces that is packed, and the folder."""
     it = random_force_psi(scaled=0.02)
     statistics = normalisation.Statistics(*(np.zeros(1, np.float32) for _ in normalisation.Statistics._fields))
-    phi = {
-        "params": {"garment": it.garment, "inverse_hessian": np.eye(40, dtype=np.float32)},
-        "statistics": {"mesh": statistics},
-    }
-    trained.write(tmp_path, it.experiment.config, phi, it.predictor, it.scales)
-    found = trained.psi(tmp_path).predictor
-    for name, leaf in checkpoint.named(it.predictor).items():
-        error = np.abs(checkpoint.named(found)[name] - leaf).max()
-        assert error <= 1e-3 * np.abs(leaf).max(), name
+    params = {"garment": it.garment, "inverse_hessian": np.eye(40, dtype=np.float32)}
+    trained.write(
+        tmp_path, it.experiment.config, {"params": params, "statistics": {"mesh": statistics}}, it.predictor, it.scales
+    )
+    return it, tmp_path
+
+
+def test_a_packed_model_errs_by_half_a_step_of_each_run(packed):
+    """Of every 32 entries, so that a large one costs its neighbours alone the bits, in all arrays, shapes too."""
+    it, folder = packed
+    found = trained.psi(folder)
+    pairs = [
+        *zip(checkpoint.named(it.predictor).values(), checkpoint.named(found.predictor).values(), strict=True),
+        (it.garment["blendshapes"], found.garment["blendshapes"]),
+    ]
+    large = 0
+    for expected, leaf in pairs:
+        expected, leaf = np.asarray(expected).reshape(-1), np.asarray(leaf).reshape(-1)
+        for start in range(0, expected.size, trained.RUN):
+            run = expected[start : start + trained.RUN]
+            assert np.abs(leaf[start : start + trained.RUN] - run).max() <= np.abs(run).max() * (1 / 254 + 1e-6)
+        large += np.any(leaf != expected)
+    assert large > 3
+
+
+def test_a_model_packed_with_a_scale_for_each_column_is_read(packed):
+    _, folder = packed
+    with np.load(folder / trained.WEIGHTS) as file:
+        arrays = dict(file)
+    name, rng = "predictor/linear/kernel", np.random.default_rng(0)
+    arrays[name] = rng.integers(-127, 128, size=arrays[name].shape).astype(np.int8)
+    arrays[f"{name}|scale"] = rng.uniform(size=arrays[name].shape[1]).astype(np.float32)
+    for other in [key.removesuffix("|scale") for key in arrays if key.endswith("|scale") and not key.startswith(name)]:
+        del arrays[f"{other}|scale"]
+        arrays[other] = arrays[other].astype(np.float16)
+    np.savez(folder / trained.WEIGHTS, **(arrays | {"format": np.int32(3)}))
+    found = trained.psi(folder).predictor["linear"]["kernel"]
+    np.testing.assert_allclose(found, arrays[name] * arrays[f"{name}|scale"], rtol=1e-6)
