@@ -3,6 +3,7 @@
     python -m clothjax render runs/quickstart --motions walk_3 --out walk.webp
     python -m clothjax render runs/quickstart --motions walk_3 --out comparison.png
     python -m clothjax render skirt --motions dance_3 --out skirt.mp4
+    python -m clothjax render skirt --motions dance_3 --out skirt.webp --beside
     python -m clothjax render skirt --motions walk_3 dance_3 --out skirt.usdc     # skirt_walk_3.usdc and so on
     python -m clothjax render skirt --motions dance_3 --out skirt.glb --skinned
 
@@ -11,6 +12,9 @@ garment and body as meshes, .obj with one file a frame. .pc2 and .mdd hold the g
 of the mesh to put them on. .png compares skinning, Phi, Psi and the reference solver on a clip that `clothjax evaluate`
 has measured. Each of several motions gets its own file.
 
+With --beside a film shows Psi and the reference solver side by side, on a clip that `clothjax evaluate` has measured.
+The cloth of films has a check, which shows how it stretches and folds.
+
 With --skinned a .glb is for engines: body and garment are skinned meshes on one skeleton. The motion animates joints,
 and morph targets for the garment's folds. Without --motions it has the canonical pose alone.
 """
@@ -18,7 +22,7 @@ and morph targets for the garment's folds. Without --motions it has the canonica
 from pathlib import Path
 
 from clothjax import cli
-from clothjax.evaluation.pictures import WRITERS, perform, perform_skinned, write_comparison
+from clothjax.evaluation.pictures import FILMS, WRITERS, perform, perform_beside, perform_skinned, write_comparison
 from clothjax.evaluation.rollouts import load_run
 from clothjax.render.skinned_gltf import to_skinned_glb
 from clothjax.runtime import trained
@@ -40,6 +44,7 @@ def main(argv: list[str]) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help=f"a file of .png, {', '.join(WRITERS)}")
     parser.add_argument("--frames", type=int, default=None, help="at the most; default: the configured number")
+    parser.add_argument("--beside", action="store_true", help="a film of Psi beside the reference solver")
     parser.add_argument("--skinned", action="store_true", help="write a .glb with a skeleton")
     parser.add_argument(
         "--betas", type=float, nargs="+", default=None, help="of the body, with --skinned; default: the mean body"
@@ -50,6 +55,8 @@ def main(argv: list[str]) -> None:
         raise ValueError(f"{arguments.out}: cannot write {kind!r}; allowed: .png, {', '.join(WRITERS)}")
     if arguments.skinned and kind != ".glb":
         raise ValueError(f"{arguments.out}: --skinned is of .glb, not of {kind}")
+    if arguments.beside and kind not in FILMS:
+        raise ValueError(f"{arguments.out}: --beside is of {' and '.join(FILMS)}, not of {kind}")
     if arguments.betas and not arguments.skinned:
         raise ValueError("--betas is of --skinned; other files show the body of the evaluation")
     run = trained.find(arguments.model)
@@ -69,7 +76,8 @@ def main(argv: list[str]) -> None:
             errors = to_skinned_glb(out, perform_skinned(run, experiment, played, frames, betas))
             print(f"morph targets err by {1e3 * max(errors.values()):.2f} mm at most")
         else:
-            WRITERS[kind](out, perform(run, experiment, motion, frames))
+            play = perform_beside if arguments.beside else perform
+            WRITERS[kind](out, play(run, experiment, motion, frames))
         print(f"written to {out.with_name(f'{out.stem}_NNNN.obj') if kind == '.obj' else out}")
 
 

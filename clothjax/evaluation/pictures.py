@@ -72,16 +72,35 @@ def gallery(run: Path, motions: list[str], frame: int) -> tuple[dict[str, list[n
 
 ROWS = {"lbs": "LBS", "phi": "Phi", "psi": "Psi"}  # of a comparison, and the solver
 SIZE = (360, 480)
+FILM, AROUND = (480, 640), 1.3  # of a film: pixels, and how much more than the garment the camera sees
 
 
 def perform(run: Path, experiment: Experiment, motion: str, frames: int) -> Performance:
     """Roll Psi out over at most `frames` frames of a clip; return the garment, on the body if the scene has one."""
     clip = assembly.motion(experiment, motion)
     garment = psi_trajectory(loading.load(run, betas=assembly.betas(experiment.config)), clip)[:frames]
-    body, root = body_trajectory(experiment, clip)
+    return _performance(experiment, clip, garment)
+
+
+def perform_beside(run: Path, experiment: Experiment, motion: str, frames: int) -> dict[str, Performance]:
+    """Return Psi and the reference solver over at most `frames` frames of a clip, by name, as `perform` does.
+
+    Raises:
+        ValueError: if `clothjax evaluate` has not measured the run on this clip.
+    """
+    tracks, clip = Tracks.load(run, motion), assembly.motion(experiment, motion)
+    frames = min(frames, len(tracks.solver))
+    both = {"Psi": tracks.stages["psi"], "reference solver": tracks.solver}
+    return {name: _performance(experiment, clip, track[:frames]) for name, track in both.items()}
+
+
+def _performance(experiment: Experiment, clip: Motion, garment: np.ndarray) -> Performance:
+    """Return a garment [T, V, 3] m over the start of a clip, on the body if the scene has one."""
+    frames, (body, root) = len(garment), body_trajectory(experiment, clip)
+    cloth = experiment.garment
     parts = (
         Part("body", body[:frames], np.asarray(experiment.body.faces), SKIN),
-        Part("garment", garment, np.asarray(experiment.garment.faces), CLOTH),
+        Part("garment", garment, np.asarray(cloth.faces), CLOTH, np.asarray(cloth.vertices)),
     )
     return Performance(parts if experiment.scene.touchable else parts[1:], root[:frames], clip.fps)
 
@@ -137,22 +156,35 @@ def _unskinned(body: Body, joints: Array, weights: np.ndarray) -> Callable:
 
 
 def film(write: Callable) -> Callable:
-    """Return a writer of performances from a writer of pictures. The camera follows the root, but not up and down.
+    """Return a writer of performances from a writer of pictures.
+
+    It takes one performance, or several by name, which are shown side by side. The garment fills the picture. The
+    camera follows the root, but not up and down.
 
     Args:
         write: takes a path, pictures and frames a second.
     """
 
-    def write_film(out: Path, shown: Performance) -> None:
-        tracks = [np.asarray(part.vertices) + shown.root[:, None] * [0.0, 1.0, 0.0] for part in shown.parts]
-        floor, camera = float(tracks[0][..., 1].min()), ray_cast.camera_for(shown.parts[0].vertices)
+    def write_film(out: Path, shown: Performance | dict[str, Performance]) -> None:
+        several = shown if isinstance(shown, dict) else {"": shown}
+        first = next(iter(several.values()))
+        tracks = {
+            name: [np.asarray(part.vertices) + one.root[:, None] * [0.0, 1.0, 0.0] for part in one.parts]
+            for name, one in several.items()
+        }
+        floor = min(float(parts[0][..., 1].min()) for parts in tracks.values())
+        camera = ray_cast.camera_for(np.concatenate([parts[-1] for parts in tracks.values()]), margin=AROUND)
         pictures = []
-        with progress_bar("rendering", len(shown.root)) as report:
-            for t in range(len(shown.root)):
-                surfaces = [Surface(x[t], part.faces, part.colour) for x, part in zip(tracks, shown.parts, strict=True)]
-                pictures.append(ray_cast.render(surfaces, camera, SIZE, floor=floor))
+        with progress_bar("rendering", len(first.root)) as report:
+            for t in range(len(first.root)):
+                each = {}
+                for name, one in several.items():
+                    pairs = zip(tracks[name], one.parts, strict=True)
+                    surfaces = [Surface(x[t], part.faces, part.colour, part.checked) for x, part in pairs]
+                    each[name] = ray_cast.render(surfaces, camera, FILM, floor=floor)
+                pictures.append(ray_cast.beside(each) if len(each) > 1 else each[""])
                 report(t + 1)
-        write(out, pictures, shown.fps)
+        write(out, pictures, first.fps)
 
     return write_film
 
@@ -217,9 +249,9 @@ def dressed(experiment: Experiment, body: np.ndarray, garment: np.ndarray) -> li
     return [Surface(body, np.asarray(experiment.body.faces), SKIN), *cloth] if experiment.scene.touchable else cloth
 
 
+FILMS = {".webp": film(ray_cast.webp), ".mp4": film(ray_cast.mp4)}
 WRITERS = {
-    ".webp": film(ray_cast.webp),
-    ".mp4": film(ray_cast.mp4),
+    **FILMS,
     ".glb": gltf.to_glb,
     ".usdc": usd.to_usd,
     ".usda": usd.to_usd,

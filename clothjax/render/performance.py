@@ -14,6 +14,7 @@ class Part(NamedTuple):
     vertices: np.ndarray  # [T, N, 3] m, relative to the root
     faces: np.ndarray  # [F, 3]
     colour: tuple[float, float, float]  # red, green, blue in [0, 1]
+    checked: np.ndarray | None = None  # [N, 3] m, places of the vertices in the cloth at rest: pictures draw a check
 
 
 class Performance(NamedTuple):

@@ -8,8 +8,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 SKIN, CLOTH, FLOOR, SKY = (0.86, 0.70, 0.60), (0.23, 0.42, 0.72), (0.93, 0.93, 0.92), (0.97, 0.975, 0.98)
-KEY_LIGHT = np.array([0.45, 0.8, 0.55])
+KEY_LIGHT = np.array([0.75, 0.6, 0.35])  # low and from the side, so that folds show
 FILL_LIGHT = np.array([-0.7, 0.25, 0.5])
+OPENING = 48  # rays that tell how much of the sky a vertex sees
+NEAR = 0.2  # m, farther surfaces leave the sky open
+CELL = 0.025  # m, side of a check
 
 
 class Surface(NamedTuple):
@@ -18,6 +21,7 @@ class Surface(NamedTuple):
     vertices: np.ndarray  # [N, 3] m
     faces: np.ndarray  # [F, 3]
     colour: tuple[float, float, float] = CLOTH
+    checked: np.ndarray | None = None  # [N, 3] m, places of the vertices in the cloth at rest: a check is drawn on it
 
 
 class Camera(NamedTuple):
@@ -53,9 +57,9 @@ def render(
     floor: float | None = None,
     samples: int = 2,
 ) -> np.ndarray:
-    """Render a lit picture [h, w, 3] uint8 of surfaces, smooth-shaded, with shadows.
+    """Render a lit picture [h, w, 3] uint8 of surfaces, smooth-shaded, with shadows and ambient occlusion.
 
-    Visibility is by ray casting, so skin shows through cloth only where it really penetrates.
+    Visibility is by ray casting, so skin shows through cloth only where it really penetrates. Both sides are seen.
 
     Args:
         size: width and height in pixels.
@@ -67,13 +71,15 @@ def render(
     """
     scene_type, mesh_type = _embree()
     scene = scene_type()
-    normals, triangles, colours = [], [], []
+    places, normals = [], []
     for surface in surfaces:
-        vertices = np.ascontiguousarray(surface.vertices, np.float32)
-        mesh_type(scene, vertices, np.ascontiguousarray(surface.faces, np.int32))
-        normals.append(vertex_normals(vertices, surface.faces))
-        triangles.append(surface.faces)
-        colours.append(surface.colour)
+        places.append(np.ascontiguousarray(surface.vertices, np.float32))
+        mesh_type(scene, places[-1], np.ascontiguousarray(surface.faces, np.int32))
+        normals.append(vertex_normals(places[-1], surface.faces))
+    # of the front and of the back of each vertex
+    openings = [
+        np.stack([_open(scene, x, side * n) for side in (1, -1)], 1) for x, n in zip(places, normals, strict=True)
+    ]
     width, height = size[0] * samples, size[1] * samples
     origins, directions = _rays(camera, width, height)
     hit = scene.run(origins, directions, query="INTERSECT", output=1)
@@ -82,20 +88,22 @@ def render(
     points = np.zeros_like(origins)
     normal = np.zeros_like(origins)
     base = np.zeros_like(origins)
-    for index, faces in enumerate(triangles):
+    opening = np.ones((len(origins), 2), np.float32)
+    for index, surface in enumerate(surfaces):
         chosen = np.flatnonzero(struck & (hit["geomID"] == index))
-        corners = np.asarray(faces)[hit["primID"][chosen]]
-        u, v = hit["u"][chosen, None], hit["v"][chosen, None]
-        blend = (1 - u - v, u, v)
-        normal[chosen] = sum(w * normals[index][corners[:, k]] for k, w in enumerate(blend))
-        points[chosen] = sum(
-            w * np.asarray(surfaces[index].vertices, np.float32)[corners[:, k]] for k, w in enumerate(blend)
-        )
-        base[chosen] = colours[index]
-    # both sides of cloth are seen; its inside a little darker
+        corners = np.asarray(surface.faces)[hit["primID"][chosen]]
+        u, v = hit["u"][chosen], hit["v"][chosen]
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        for found, values in ((points, places), (normal, normals), (opening, openings)):
+            found[chosen] = np.einsum("nk,nkc->nc", weights, values[index][corners])
+        base[chosen] = surface.colour
+        if surface.checked is not None:
+            base[chosen[_dark(np.asarray(surface.checked)[corners], weights)]] *= 0.8
+    # the inside of cloth is a little darker
     behind = np.sum(normal * directions, axis=1) > 0
     base[behind & struck] *= 0.75
     normal[behind] *= -1
+    opening = np.where(behind, opening[:, 1], opening[:, 0])
     if floor is not None:
         distance = (floor - origins[:, 1]) / np.where(directions[:, 1] < -1e-6, directions[:, 1], -1e-6)
         on_floor = ~struck & (directions[:, 1] < -1e-6) & (distance > 0)
@@ -104,7 +112,7 @@ def render(
     else:
         on_floor = np.zeros(len(origins), bool)
     lit = np.flatnonzero(struck | on_floor)
-    shade = _shade(scene, points[lit], normal[lit], base[lit])
+    shade = _shade(scene, points[lit], normal[lit], base[lit], opening[lit])
     if on_floor.any():
         # the floor fades into the sky away from its subject
         spread = np.linalg.norm(points[lit][:, [0, 2]] - camera.target[[0, 2]], axis=1)
@@ -140,6 +148,17 @@ def comparison(path: str | Path | BinaryIO, rows: dict[str, Sequence[np.ndarray]
         for c, picture in enumerate(pictures):
             sheet.paste(image.fromarray(picture), (left + width * c, top + height * r))
     sheet.save(path, format="png")
+
+
+def beside(pictures: dict[str, np.ndarray]) -> np.ndarray:
+    """Return pictures [h, w, 3] uint8 of one height side by side, each with its name at the top."""
+    image, draw, font = _pillow("Image", "ImageDraw", "ImageFont")
+    sheet = image.fromarray(np.concatenate(list(pictures.values()), axis=1))
+    pen, letters, left = draw.Draw(sheet), font.load_default(20), 0
+    for name, picture in pictures.items():
+        pen.text((left + picture.shape[1] / 2, 20), name, fill="black", font=letters, anchor="mm")
+        left += picture.shape[1]
+    return np.asarray(sheet)
 
 
 def webp(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int = 82) -> None:
@@ -180,18 +199,53 @@ def mp4(path: str | Path, frames: Sequence[np.ndarray], fps: float, quality: int
         film.mux(stream.encode())
 
 
-def _shade(scene, points: np.ndarray, normal: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return the colours of points under a key light with shadow, a fill light and light from the sky."""
+def _dark(corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return which places, by weights [N, 3] of the corners [N, 3, 3] m of triangles, are in a dark field of a check.
+
+    The check lies in the plane of two axes that a triangle faces most.
+    """
+    normals = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    fields = np.floor(np.einsum("nk,nkc->nc", weights, corners) / CELL)
+    fields[np.arange(len(fields)), normals.argmax(axis=1)] = 0.0
+    return fields.sum(axis=1) % 2 == 0
+
+
+def _open(scene, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the share [N] of the sky above the vertices [N, 3] m that no surface within `NEAR` hides."""
+    # evenly spread about the normal, by the cosine: a spiral on the disk, raised to the sphere
+    count = np.arange(OPENING) + 0.5
+    radius, angle = np.sqrt(count / OPENING), count * np.pi * (3.0 - np.sqrt(5.0))
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)], axis=1)
+    helper = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    side = np.cross(helper, normals)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-20)
+    axes = np.stack([side, np.cross(normals, side), normals], axis=1)  # [N, 3, 3]
+    directions = np.einsum("ka,nac->nkc", local, axes).reshape(-1, 3).astype(np.float32)
+    start = np.repeat(vertices + 2e-3 * normals, OPENING, axis=0).astype(np.float32)
+    free = _unhidden(scene, start, directions, NEAR)
+    return free.reshape(-1, OPENING).mean(axis=1).astype(np.float32)
+
+
+def _unhidden(scene, start: np.ndarray, directions: np.ndarray, within: float = np.inf) -> np.ndarray:
+    """Return which rays [N] hit nothing within a distance in m."""
+    far = np.full(len(start), min(within, 1e30), np.float32)
+    return np.asarray(scene.run(start, directions, far, query="OCCLUDED")) < 0
+
+
+def _shade(scene, points: np.ndarray, normal: np.ndarray, base: np.ndarray, opening: np.ndarray) -> np.ndarray:
+    """Return the colours of points under a key light with shadow, a fill light and light from the sky.
+
+    Args:
+        opening: [N], the share of the sky that each point sees.
+    """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
     key, fill = (light / np.linalg.norm(light) for light in (KEY_LIGHT, FILL_LIGHT))
     toward = np.tile(key.astype(np.float32), (len(points), 1))
     start = (points + 4e-3 * normal).astype(np.float32)  # clear of the surface the point is on
-    shadow = scene.run(start, toward, query="OCCLUDED")
-    lit = (np.asarray(shadow) < 0).astype(np.float32) if shadow.dtype.kind == "i" else ~shadow.astype(bool)
-    diffuse = np.clip(normal @ key, 0, None) * lit
+    diffuse = np.clip(normal @ key, 0, None) * _unhidden(scene, start, toward)
     soft = 0.5 + 0.5 * np.clip(normal @ fill, -1, 1)
     sky = 0.5 + 0.5 * normal[:, 1]
-    return base * (0.72 * diffuse + 0.22 * soft + 0.26 * sky)[:, None]
+    return base * (0.74 * diffuse + (0.2 * soft + 0.34 * sky) * opening)[:, None]
 
 
 def _rays(camera: Camera, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

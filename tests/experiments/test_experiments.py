@@ -97,6 +97,12 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch
     assert "| hold_gap |" in capsys.readouterr().out
     render.main([str(finished), "--motions", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
     assert picture(finished / "t.webp").frames == 3
+    command = [str(finished), "--out", str(finished / "b.webp"), "--frames", "4", "--beside"]
+    render.main(command)
+    beside, alone = picture(finished / "b.webp"), picture(finished / "t.webp")
+    assert beside.frames == 4 and beside.width == 2 * alone.width
+    with pytest.raises(ValueError, match=r"b\.glb: --beside is of \.webp and \.mp4, not of \.glb"):
+        render.main([str(finished), "--out", str(finished / "b.glb"), "--beside"])
     with pytest.raises(ValueError, match=r"cannot write '\.gif'"):
         render.main([str(finished), "--out", "x.gif"])
     path = finished / "bodies.png"

@@ -52,6 +52,39 @@ def test_a_shadow_falls_on_the_floor():
     assert (below > 60).any()
 
 
+def test_a_valley_is_darker_than_a_plain_and_a_far_wall_hides_nothing():
+    vertices, faces = sheet(40)
+    camera = ray_cast.camera_for(vertices, "front")
+
+    def middle(*others):
+        return ray_cast.render([Surface(vertices, faces), *others], camera, (60, 60))[20:40, 30].astype(int).sum()
+
+    # walls at right angles beside the middle, edge-on to the camera, on the side that the key light does not come from
+    wall = vertices[:, [2, 1, 0]]
+    near, far = (Surface(wall + [-x, 0, 0.5], faces) for x in (0.06, 0.3))
+    assert middle(near) < 0.93 * middle() and middle(far) == middle()
+
+
+def test_a_check_has_fields_of_one_size_on_the_cloth_at_rest():
+    vertices, faces = sheet(40)
+    camera = ray_cast.camera_for(vertices, "front")
+    for stretch, count in ((1.0, 40), (2.0, 20)):  # what is shown twice as large as it is at rest has half the fields
+        checked = Surface(vertices, faces, checked=vertices / stretch + 1e-4)
+        row = ray_cast.render([checked], camera, (400, 400), samples=1)[203, :, 2].astype(int)
+        inside = row[30:370]
+        changes = np.count_nonzero(np.abs(np.diff(inside)) > 15)
+        assert count * 0.75 <= changes <= count
+
+
+def test_pictures_beside_each_other_keep_their_order_and_have_names():
+    first, second = (np.full((60, 80, 3), grey, np.uint8) for grey in (200, 100))
+    both = ray_cast.beside({"Psi": first, "solver": second})
+    assert both.shape == (60, 160, 3)
+    np.testing.assert_array_equal(both[40:, :80], first[40:])
+    np.testing.assert_array_equal(both[40:, 80:], second[40:])
+    assert (both[:40, :80] == 0).any() and (both[:40, 80:] == 0).any()
+
+
 def test_comparison_and_webp_hold_every_picture(tmp_path):
     pictures = [np.full((20, 30, 3), 40 * k, np.uint8) for k in range(4)]
     ray_cast.comparison(tmp_path / "c.png", {"one": pictures[:2], "two": pictures[2:]}, ["a", "b"])
