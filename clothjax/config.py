@@ -373,12 +373,12 @@ class LabelsConfig:
     """Training steps of a round."""
     anew: bool = False
     """Each round begins with the ridge solution of all frames so far, for few frames and steps."""
-    last_steps: int = 12000
+    last_steps: int = 8000
     """Training steps on all frames after the last round, by a network drawn anew. 0: none."""
     batch: int = 512
     learning_rate: float = 5e-4
-    decay: float = 0.05
-    """Weight decay."""
+    decay: float = 2.0
+    """Weight decay, relative to the rate. Without it the network overfits a hundred thousand frames."""
     ridge: float = 300.0
     """Penalty on the linear map that training begins with."""
     seed: int = 0
