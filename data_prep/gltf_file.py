@@ -52,7 +52,8 @@ def naming(path: str | Path) -> Iterator[None]:
     try:
         yield
     except UNREADABLE as error:
-        detail = error if isinstance(error, ValueError) else f"damaged, or not glTF: {type(error).__name__} {error}"
+        told = isinstance(error, ValueError) and not isinstance(error, (json.JSONDecodeError, UnicodeDecodeError))
+        detail = error if told else f"damaged, or not glTF: {type(error).__name__} {error}"
         prefix = "" if str(detail).startswith(str(path)) else f"{path}: "
         raise ValueError(f"{prefix}{detail}") from error
 
@@ -70,6 +71,8 @@ class Document:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         data, self.binary = self.path.read_bytes(), b""
+        if not data:
+            raise ValueError("an empty file: copy or download it again")
         if data[:4] == GLB:
             at, chunks = 12, []
             while at + 8 <= len(data):

@@ -8,8 +8,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 SKIN, CLOTH, FLOOR, SKY = (0.86, 0.70, 0.60), (0.23, 0.42, 0.72), (0.93, 0.93, 0.92), (0.97, 0.975, 0.98)
-KEY_LIGHT = np.array([0.75, 0.6, 0.35])  # low and from the side, so that folds show
-FILL_LIGHT = np.array([-0.7, 0.25, 0.5])
+KEY_LIGHT = np.array([0.42, 0.6, 0.71])  # low and from the side, so that folds show; the camera looks from +z
+FILL_LIGHT = np.array([-0.86, 0.25, 0.02])
 OPENING = 48  # rays that tell how much of the sky a vertex sees
 NEAR = 0.2  # m, farther surfaces leave the sky open
 CELL = 0.025  # m, side of a check
@@ -112,7 +112,7 @@ def render(
     else:
         on_floor = np.zeros(len(origins), bool)
     lit = np.flatnonzero(struck | on_floor)
-    shade = _shade(scene, points[lit], normal[lit], base[lit], opening[lit])
+    shade = _shade(scene, camera, points[lit], normal[lit], base[lit], opening[lit])
     if on_floor.any():
         # the floor fades into the sky away from its subject
         spread = np.linalg.norm(points[lit][:, [0, 2]] - camera.target[[0, 2]], axis=1)
@@ -232,14 +232,20 @@ def _unhidden(scene, start: np.ndarray, directions: np.ndarray, within: float = 
     return np.asarray(scene.run(start, directions, far, query="OCCLUDED")) < 0
 
 
-def _shade(scene, points: np.ndarray, normal: np.ndarray, base: np.ndarray, opening: np.ndarray) -> np.ndarray:
+def _shade(
+    scene, camera: Camera, points: np.ndarray, normal: np.ndarray, base: np.ndarray, opening: np.ndarray
+) -> np.ndarray:
     """Return the colours of points under a key light with shadow, a fill light and light from the sky.
+
+    The lights go around with the camera.
 
     Args:
         opening: [N], the share of the sky that each point sees.
     """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    key, fill = (light / np.linalg.norm(light) for light in (KEY_LIGHT, FILL_LIGHT))
+    x, _, z = (camera.eye - camera.target) / max(float(np.linalg.norm((camera.eye - camera.target)[[0, 2]])), 1e-9)
+    turn = np.array([[z, 0.0, x], [0.0, 1.0, 0.0], [-x, 0.0, z]])
+    key, fill = (turn @ light / np.linalg.norm(light) for light in (KEY_LIGHT, FILL_LIGHT))
     toward = np.tile(key.astype(np.float32), (len(points), 1))
     start = (points + 4e-3 * normal).astype(np.float32)  # clear of the surface the point is on
     diffuse = np.clip(normal @ key, 0, None) * _unhidden(scene, start, toward)

@@ -222,6 +222,14 @@ def test_what_is_no_character_is_refused_with_what_to_do(rig, walk, tmp_path, mo
         character.read(written(tmp_path, far, rig.names, walk))
     with pytest.raises(ValueError, match=r"none\.glb: no such file"):
         character.read(tmp_path / "none.glb")
+    for content, reason in (
+        (b"", "an empty file: copy or"),
+        (b"<html>", "damaged, or not glTF: JSON"),
+        (b"\xff\xfe", "not glTF"),
+    ):
+        (tmp_path / "page.glb").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"page\.glb: .*{reason}"):
+            character.read(tmp_path / "page.glb")
 
 
 def test_bones_that_an_animation_stretches_are_told(rig, walk, tmp_path):
