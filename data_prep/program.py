@@ -69,6 +69,8 @@ class SkeletonOptions(MotionOptions):
     """Axis of the file that becomes forward, +z; unless given, the figure keeps its heading."""
     joints: Path | None = None
     """File that says which joint is which part, `left upper arm: Bone.012`, for names that are not known."""
+    by_positions: bool = False
+    """Take where the joints are, and leave their rotations, which some programs turn about the bones as they like."""
     allow: bool = False
     """Take a recording without arms or head, and a result that differs from the recording."""
     abduct: float = 0.0
@@ -119,6 +121,7 @@ def retarget_as_asked(capture: Capture, rig: Rig, options: SkeletonOptions, reco
         drop_clavicles=options.drop_clavicles,
         freeze=options.freeze,
         axes=Axes(options.up, options.forward),
+        by_positions=options.by_positions,
         allow=options.allow,
         about=str(recording),
         tell=lambda line: print(f"{recording}: {line}"),

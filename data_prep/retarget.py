@@ -5,7 +5,7 @@ figure stands like the body (`rest_pose.py`). Bones of arms and legs are aligned
 The root's path is scaled by the length of a leg. At last the result is compared with the recording.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.body.plausibility import body_kinematics, joint_positions
 from clothjax.types import Body, Motion
+from data_prep import by_positions as positions
 from data_prep import rest_pose, skeleton
 from data_prep.doubts import ground
 from data_prep.recording import Capture, resample
@@ -44,6 +45,7 @@ def retarget(
     drop_clavicles: float = 0.0,
     freeze: bool = True,
     axes: Axes = FOUND,
+    by_positions: bool = False,
     allow: bool = False,
     about: str = "the recording",
     tell: Callable[[str], object] = str,
@@ -60,6 +62,7 @@ def retarget(
         drop_clavicles: degrees by which the clavicles are lowered.
         freeze: keep hands, fingers and toes as in the canonical pose; captured ones are often noise.
         axes: of the recording.
+        by_positions: go by where its joints are, and leave their rotations.
         allow: take a result that differs from the recording.
         about: name of the recording, for messages.
         tell: called with a line about each thing that had to be read off the frames, or is hardly meant.
@@ -84,6 +87,10 @@ def retarget(
     rest = is_rest_pose(resting, of_file)
     up = _up(shown, of_file, rest, axes, about, allow, tell)
     shown = shown.turned(turn_upright(AXES[up], None if axes.forward is None else AXES[axes.forward]))
+    if by_positions:
+        scale = leg_length(body.joints, of_body) / leg_length(shown.positions[0], of_file)
+        world = _by_positions(shown, of_file, body, of_body, names, _corrections(abduct, drop_clavicles))
+        return _placed(world, shown, scale, body, of_body, of_file, fps, allow, about, abduct + drop_clavicles, tell)
     if rest is None:
         frame = rest_pose.straightest(shown, of_file)
         reference = rest_pose.standing(shown, resting, capture.parents, of_file, frame)
@@ -110,13 +117,51 @@ def retarget(
     _fill(world, of_body, pairs)
 
     scale = leg_length(body.joints, of_body) / leg_length(posed, of_file)
+    return _placed(world, shown, scale, body, of_body, of_file, fps, allow, about, abduct + drop_clavicles, tell)
+
+
+def _by_positions(
+    shown: Figure,
+    of_file: Parts,
+    body: Body,
+    of_body: Parts,
+    names: tuple[str, ...],
+    corrections: dict[str, np.ndarray],
+) -> np.ndarray:
+    """Return the world rotations [T, J, 3, 3] of a body by where the joints of a recording are."""
+    turned = positions.world_rotations(shown.positions, of_file, body.joints, body.parents, names, of_body)
+    part_of = {joint: part for part, joint in of_body.limbs.items()}
+    world = np.tile(np.eye(3), (len(shown.positions), len(names), 1, 1))
+    for j, parent in enumerate(body.parents):
+        if j in turned:
+            world[:, j] = turned[j] @ corrections.get(part_of.get(j, ""), np.eye(3))
+        elif parent >= 0:
+            world[:, j] = world[:, parent]
+    _fill(world, of_body, turned)
+    return world
+
+
+def _placed(
+    world: np.ndarray,
+    shown: Figure,
+    scale: float,
+    body: Body,
+    of_body: Parts,
+    of_file: Parts,
+    fps: float,
+    allow: bool,
+    about: str,
+    allowance: float,
+    tell: Callable[[str], object],
+) -> Motion:
+    """Return the motion of a body with world rotations [T, J, 3, 3] along a recording's path; `compare` it."""
     path = shown.positions[:, of_file.hips]
     path = (path - path[0] * [1, 0, 1]) * scale - body.joints[0]
     motion = stand(Motion(relative(world, body.parents).astype(np.float32), path, float(fps)), body)
     for line in ground(float(path[0, 1] - motion.translation[0, 1])):
         tell(line)
     if not allow:
-        compare(motion, body, of_body, shown, of_file, about, abduct + drop_clavicles)
+        compare(motion, body, of_body, shown, of_file, about, allowance)
     return motion
 
 
@@ -163,7 +208,7 @@ def _beyond(parents: np.ndarray, parts: Parts) -> set[int]:
     return {j for j in range(len(parents)) if ends & set(skeleton.ancestors(j, parents))}
 
 
-def _fill(world: np.ndarray, parts: Parts, pairs: dict[int, int]) -> None:
+def _fill(world: np.ndarray, parts: Parts, pairs: Collection[int]) -> None:
     """Turn the joints of a trunk that the file does not have in equal shares between those around them."""
     chain = parts.chain
     moved = [k for k, joint in enumerate(chain) if joint in pairs]
@@ -214,7 +259,7 @@ def compare(
             f"{about}: the {worst} would be {medians[worst]:.0f} degrees off: in frame {frame} it points to "
             f"{np.round(recorded[worst][frame], 2).tolist()} in the recording, to "
             f"{np.round(found[worst][frame], 2).tolist()} in the result (x left, y up, z forward). "
-            "Check --up and --joints; --allow takes it all the same"
+            "Check --up and --joints; --by-positions leaves the recording's rotations; --allow takes it all the same"
         )
 
 

@@ -8,7 +8,7 @@ import pytest
 from recorded import CROSSED, Take, other_side, write_bvh
 from scipy.spatial.transform import Rotation
 
-from clothjax.body.plausibility import joint_positions
+from clothjax.body.plausibility import body_kinematics, joint_positions
 from clothjax.files import storage
 from data_prep import amass, bvh, procedural, program, rest_pose, retarget, skeleton
 from data_prep.recording import Capture, resample
@@ -463,3 +463,64 @@ def test_the_cases_are_the_plain_walk(case, rig):
     for path in sorted((CASES / f"bvh_{case}").glob("*.bvh")):
         found, _ = retargeted(path, rig)
         assert np.delete(np.linalg.norm(found - plain, axis=-1), beyond(rig), axis=1).max() < 0.01, path
+
+
+def scrambled(capture):
+    """The same positions of joints, each of which is turned about itself as it likes; a helper turns what it carries
+    back."""
+    count, frames, random = len(capture.names), len(capture.translation), np.random.default_rng(4)
+    angles = np.radians(120) * np.sin(0.2 * np.arange(frames)[:, None] + random.uniform(0, 6, count))
+    about = random.normal(size=(count, 3))
+    about /= np.linalg.norm(about, axis=1, keepdims=True)
+    turns = Rotation.from_rotvec((angles[..., None] * about).reshape(-1, 3)).as_matrix().reshape(frames, count, 3, 3)
+    names, parents, offsets, rotations, place = [], [], [], [], {}
+    for j, parent in enumerate(capture.parents):
+        if parent >= 0:
+            names.append(f"helper{j}")
+            parents.append(place[parent])
+            offsets.append(np.zeros(3))
+            rotations.append(np.swapaxes(turns[:, parent], -1, -2))
+        place[j] = len(names)
+        names.append(capture.names[j])
+        parents.append(place[j] - 1)
+        offsets.append(capture.offsets[j])
+        rotations.append(capture.rotations[:, j] @ turns[:, j])
+    return capture._replace(
+        names=tuple(names), parents=np.array(parents), offsets=np.array(offsets), rotations=np.stack(rotations, axis=1)
+    )
+
+
+@pytest.mark.parametrize("turn", [np.eye(3), Z_UP], ids=["y up", "z up"])
+def test_rotations_that_mean_nothing_are_refused_or_left(turn, plain, rig, tmp_path):
+    capture = scrambled(bvh.read_bvh(dialect(tmp_path / "walk.bvh", turn=turn)))
+    with pytest.raises(ValueError, match=r"walk: the \S+.* would be \d+ degrees off: .*--by-positions leaves"):
+        retarget.retarget(capture, *rig, about="walk")
+    motion = retarget.retarget(capture, *rig, about="walk", by_positions=True)
+    found = joint_positions(motion, rig.body)
+    assert np.delete(np.linalg.norm(found - plain, axis=-1), beyond(rig), axis=1).max() < 0.04  # m, at the head
+    given = retarget.retarget(bvh.read_bvh(tmp_path / "walk.bvh"), *rig)
+    one, other = (body_kinematics(each, rig.body)[0] for each in (motion, given))
+    for name, most in (
+        ("LeftArm", 1),
+        ("RightForeArm", 1),
+        ("LeftUpLeg", 1),
+        ("RightLeg", 1),
+        ("Spine1", 5),
+        ("Head", 20),
+    ):
+        j = rig.names.index(name)
+        apart = Rotation.from_matrix(np.swapaxes(one[:, j], -1, -2) @ other[:, j]).magnitude()
+        assert np.degrees(apart).max() < most, name
+
+
+def test_a_limb_that_never_bends_is_turned_as_in_a_t_pose(plain, rig, tmp_path):
+    capture = bvh.read_bvh(dialect(tmp_path / "walk.bvh"))
+    for name in ("LeftForeArm", "LeftLeg"):
+        capture.rotations[:, capture.names.index(name)] = np.eye(3)
+    motion = retarget.retarget(scrambled(capture), *rig, about="walk", by_positions=True)
+    given = retarget.retarget(capture, *rig)
+    one, other = (body_kinematics(each, rig.body)[0] for each in (motion, given))
+    for name in ("LeftArm", "LeftUpLeg"):
+        j = rig.names.index(name)
+        apart = Rotation.from_matrix(np.swapaxes(one[:, j], -1, -2) @ other[:, j]).magnitude()
+        assert np.degrees(apart).max() < 35, name  # a straight limb does not show how it is turned about itself
