@@ -5,9 +5,11 @@ displacements in the plane that go with the fold. These steps find them. They re
 the code's.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from clothjax.geometry.vectors import at_corners
 from clothjax.physics import energies
@@ -17,36 +19,38 @@ RATE = 0.8  # of a Jacobi step; above 1.3 the shortest waves of a regular mesh g
 LONGEST = 0.005  # m, that a vertex moves in a step at most: far out of shape the cloth is many times as stiff
 
 
+class Elastic(NamedTuple):
+    """What the stretching energy of triangles depends on but positions: see `energies.stretching`."""
+
+    inverse: Array  # [F, 2, 2] 1/m
+    area: Array  # [F] m^2
+    mu: Array  # Pa
+    lam: Array  # Pa
+
+
 @jax.custom_vjp
-def stretching_gradient(
-    position: Float[Array, "V 3"],
-    faces: Int[Array, "F 3"],
-    inverse: Float[Array, "F 2 2"],
-    area: Float[Array, " F"],
-    mu: Array,
-    lam: Array,
-) -> Float[Array, "V 3"]:
-    """Return the gradient [V, 3] N of the stretching energy by positions [V, 3] m; other arguments as of its energy.
+def stretching_gradient(position: Array, faces: Array, elastic: Elastic) -> Array:
+    """Return the gradient [V, 3] N of the stretching energy of faces [F, 3] by positions [V, 3] m.
 
     Its own derivative by positions is in closed form, which takes XLA a quarter of the time of the general one.
     """
-    return _gradient(position, faces, inverse, area, mu, lam)
+    return _gradient(position, faces, elastic)
 
 
-def _gradient(position: Array, faces: Array, *cloth: Array) -> Array:
-    return jax.grad(lambda x: jnp.sum(energies.stretching(at_corners(x, faces), *cloth)))(position)
+def _gradient(position: Array, faces: Array, elastic: Elastic) -> Array:
+    return jax.grad(lambda x: jnp.sum(energies.stretching(at_corners(x, faces), *elastic)))(position)
 
 
-def _forward(*arguments: Array) -> tuple[Array, tuple[Array, ...]]:
-    return _gradient(*arguments), arguments
+def _forward(position: Array, faces: Array, elastic: Elastic) -> tuple[Array, tuple[Array, Array, Elastic]]:
+    return _gradient(position, faces, elastic), (position, faces, elastic)
 
 
-def _backward(arguments: tuple[Array, ...], cotangent: Array) -> tuple[Array | None, ...]:
-    position, faces, *cloth = arguments
+def _backward(arguments: tuple[Array, Array, Elastic], cotangent: Array) -> tuple[Array, None, Elastic]:
+    position, faces, elastic = arguments
     corners, pull = jax.vjp(lambda x: at_corners(x, faces), position)
     # the Hessian is symmetric
-    (by_position,) = pull(energies.stretching_hessian_product(corners, at_corners(cotangent, faces), *cloth))
-    _, back = jax.vjp(lambda *cloth: _gradient(position, faces, *cloth), *cloth)
+    (by_position,) = pull(energies.stretching_hessian_product(corners, at_corners(cotangent, faces), *elastic))
+    _, back = jax.vjp(lambda elastic: _gradient(position, faces, elastic), elastic)
     return by_position, None, *back(cotangent)
 
 
@@ -84,9 +88,9 @@ def relaxed(
         mobility: [V] m/N, of `mobility`.
     """
 
-    cloth = (rest.inverse, rest.face_area, material.mu, material.lam)
+    elastic = Elastic(rest.inverse, rest.face_area, material.mu, material.lam)
     for _ in range(steps):
-        move = -mobility[:, None] * stretching_gradient(position, mesh.faces, *cloth)
+        move = -mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)
         length = jnp.sum(move * move, axis=-1, keepdims=True)
         position += move / jnp.sqrt(1.0 + length / LONGEST**2)
     return position
