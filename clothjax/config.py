@@ -314,7 +314,7 @@ class PeerConfig:
 
 @dataclass(frozen=True)
 class Stage2Config:
-    """Stage 2: training of the latent predictor on rollouts of the frozen Phi (METHOD.md, Training)."""
+    """Stage 2: training of the latent predictor. With `forces`, `labels` has the other settings of its training."""
 
     steps: int = 6000
     batch: int = 32
@@ -343,6 +343,7 @@ class Stage2Config:
     seed: int = 0
 
     RETIRED: ClassVar[dict[str, Any]] = {"pushforward": False}
+    BEFORE: ClassVar[dict[str, Any]] = {"forces": False}
 
 
 @dataclass(frozen=True)
@@ -378,7 +379,7 @@ class LabelsConfig:
     batch: int = 512
     learning_rate: float = 5e-4
     decay: float = 2.0
-    """Weight decay, relative to the rate. Without it the network overfits a hundred thousand frames."""
+    """Weight decay, relative to the rate. Without it the network overfits."""
     ridge: float = 300.0
     """Penalty on the linear map that training begins with."""
     seed: int = 0

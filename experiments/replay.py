@@ -55,7 +55,7 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
         ValueError: if the stage has finished.
     """
     start, source = _start(run / stage)
-    config = configuration.from_dict(Config, source.config, str(start))
+    config = configuration.from_dict(Config, source.config, str(start), stored=True)
     total = getattr(config, stage).steps
     if source.step >= total:
         raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")

@@ -69,7 +69,7 @@ def from_safetensors(path: str | Path) -> Model:
             )
         if version == 1:
             arrays = {_renamed(name): array for name, array in arrays.items()}
-        config = configuration.from_dict(Config, about["config"], str(path))
+        config = configuration.from_dict(Config, about["config"], str(path), stored=True)
         static = {field: tuple(about[name]) for name, field in STATIC.items()}
 
         def layer(name: str) -> Layer:

@@ -17,7 +17,7 @@ from clothjax.config import ANYTHING
 Config = TypeVar("Config")
 
 
-def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> Config:
+def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = (), stored: bool = False) -> Config:
     """Load a YAML file over its `extends:` parents, then apply command-line overrides.
 
     Mappings are merged key by key; every other value, lists included, replaces its parent's.
@@ -27,13 +27,14 @@ def load(cls: type[Config], path: str | Path, overrides: Sequence[str] = ()) -> 
             `dict[str, X]` and dataclasses.
         path: the YAML file; `extends: other.yaml` is relative to it.
         overrides: such as `["--stage1.learning_rate", "3e-4"]`.
+        stored: as of `from_dict`.
 
     Raises:
         ValueError: for a file that is missing or not YAML, a cycle of `extends:`, an unknown key, a value of the
             wrong type or one that `__post_init__` refuses. The message has the file and the dotted path.
         SystemExit: for a mistake in `overrides`, after a message, or for `--help`.
     """
-    reader = _Reader(str(path))
+    reader = _Reader(str(path), stored)
     try:
         config = reader.build(cls, reader.read(Path(path), ()), "")
     except RecursionError:
@@ -73,16 +74,19 @@ def to_dict(config: Any) -> Any:
     return config
 
 
-def from_dict(cls: type[Config], values: Mapping[str, Any], source: str = "configuration") -> Config:
+def from_dict(
+    cls: type[Config], values: Mapping[str, Any], source: str = "configuration", stored: bool = False
+) -> Config:
     """Invert `to_dict`; missing keys take their defaults.
 
     Args:
         source: name of `values` in messages, such as their file.
+        stored: of a trained model. What it lacks is younger than it is, and takes the value of `BEFORE` of its section.
 
     Raises:
         ValueError: as `load`.
     """
-    return _Reader(source).build(cls, values, "")
+    return _Reader(source, stored).build(cls, values, "")
 
 
 def _override(cls: type[Config], config: Config, arguments: Sequence[str], prog: str) -> Config:
@@ -95,7 +99,8 @@ def _override(cls: type[Config], config: Config, arguments: Sequence[str], prog:
 class _Reader:
     """Reads the values of YAML files and builds dataclasses of them; its errors name the files that set a value."""
 
-    def __init__(self, default: str):
+    def __init__(self, default: str, stored: bool):
+        self.stored = stored
         self.default = default  # the source of a value that no file set
         self.sources: dict[str, tuple[str, ...]] = {}  # dotted path of a value -> the files that set it or parts of it
 
@@ -155,7 +160,8 @@ class _Reader:
         for key in set(values) & set(retired):
             if retired[key] is not ANYTHING and values[key] != retired[key]:
                 self.fail(f"is no longer a setting, it is always {retired[key]!r}", _join(path, key))
-        values = {key: value for key, value in values.items() if key not in retired}
+        before = getattr(cls, "BEFORE", {}) if self.stored else {}
+        values = before | {key: value for key, value in values.items() if key not in retired}
         for key in values:
             if key not in fields:
                 near = difflib.get_close_matches(str(key), fields, 1)

@@ -228,11 +228,11 @@ def _config(run: Path) -> Config:
     """Load the configuration of a run's last stage; earlier ones may hold other settings of later stages."""
     first, *later = (run / stage / "checkpoints" for stage in STAGES)
     last = [first, *(folder for folder in later if checkpoint.steps(folder))][-1]
-    return configuration.from_dict(Config, checkpoint.latest(last).config, str(last))
+    return configuration.from_dict(Config, checkpoint.latest(last).config, str(last), stored=True)
 
 
 def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
-    config = configuration.load(Config, directory / CONFIG)
+    config = configuration.load(Config, directory / CONFIG, stored=True)
     path = directory / WEIGHTS
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged one open

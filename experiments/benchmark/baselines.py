@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.config import Config, PeerConfig, Stage1Config
+from clothjax.config import Config, PeerConfig, Stage1Config, Stage2Config
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.networks import baselines
 from clothjax.networks.mlp import Params
@@ -34,7 +34,7 @@ class Baseline(NamedTuple):
 
 def published(vertices: int) -> Baseline:
     """Build NCS at its published sizes, with random weights, to be timed."""
-    config = Config(peer=PeerConfig("ncs"), stage1=Stage1Config(start_timestep=0.0))
+    config = Config(peer=PeerConfig("ncs"), stage1=Stage1Config(start_timestep=0.0), stage2=Stage2Config(forces=False))
     params = jax.jit(lambda k: baselines.init(k, JOINTS, 0, jnp.zeros((1, vertices, 3)), config))(jax.random.key(0))
     random = np.random.default_rng(0)
     weights = random.dirichlet(np.ones(JOINTS), vertices).T

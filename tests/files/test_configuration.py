@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import pytest
+import yaml
 
 from clothjax import config as config_module
 from clothjax.files import configuration
@@ -82,6 +83,19 @@ def test_relaxation_needs_forces_and_few_steps(values, reason):
     with pytest.raises(ValueError, match=reason):
         configuration.from_dict(config_module.Config, values)
     assert configuration.from_dict(config_module.Config, {"model": {"relaxation": 16}, "stage2": {"forces": True}})
+
+
+def test_a_stored_configuration_without_a_setting_is_older_than_it(tmp_path):
+    """What a model was trained with does not change with today's defaults; what a user writes has them."""
+    old = configuration.to_dict(config_module.Config())
+    del old["stage2"]["forces"]
+    assert configuration.from_dict(config_module.Config, old).stage2.forces
+    assert not configuration.from_dict(config_module.Config, old, stored=True).stage2.forces
+    path = write(tmp_path, "c.yaml", yaml.safe_dump(old))
+    assert configuration.load(config_module.Config, path).stage2.forces
+    assert not configuration.load(config_module.Config, path, stored=True).stage2.forces
+    old["stage2"]["forces"] = True
+    assert configuration.from_dict(config_module.Config, old, stored=True).stage2.forces
 
 
 SECTIONS = [cls for cls in vars(config_module).values() if hasattr(cls, "RETIRED")]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from toy import assert_same, small
 
-from clothjax.config import Config, PeerConfig, Stage1Config
+from clothjax.config import Config, PeerConfig, Stage1Config, Stage2Config
 from clothjax.files import checkpoint
 from clothjax.networks import baselines
 from clothjax.networks.animators import phi_animator
@@ -135,7 +135,11 @@ def test_shipped_garments_have_the_names_and_shapes_of_the_modules(name):
 
 @pytest.mark.parametrize("network", ["ncs", "snug", "direct"])
 def test_baselines_are_modules_too(network):
-    config = Config(peer=PeerConfig(network, width=8, blendshapes=9), stage1=Stage1Config(start_timestep=0.0))
+    config = Config(
+        peer=PeerConfig(network, width=8, blendshapes=9),
+        stage1=Stage1Config(start_timestep=0.0),
+        stage2=Stage2Config(forces=False),
+    )
     shapes = jnp.ones((config.model.blendshapes, 7, 3))
     params = jax.jit(lambda key: baselines.init(key, 2, 3, shapes, config))(jax.random.key(0))
     names = {
@@ -149,12 +153,12 @@ def test_baselines_are_modules_too(network):
 
 def test_a_packed_model_of_a_newer_format_is_refused(tmp_path, monkeypatch):
     shutil.copytree(trained.find("skirt"), tmp_path / "skirt")
-    config, model = trained.phi(tmp_path / "skirt")  # the first format, which has no number
+    config, model = trained.phi(tmp_path / "skirt")  # of the format before
     _, _, predictor, normalizers = trained.psi(tmp_path / "skirt")
     trained.write(tmp_path / "again", config, model, predictor, normalizers)
     with np.load(tmp_path / "again" / trained.WEIGHTS) as file:
-        assert file["format"] == trained.FORMAT == 3
+        assert file["format"] == trained.FORMAT == 4
     assert list(checkpoint.named(trained.phi(tmp_path / "again")[1])) == list(checkpoint.named(model))
-    monkeypatch.setattr(trained, "FORMAT", 2)
-    with pytest.raises(ValueError, match=r"model\.npz: has format 3, .* reads up to 2; update it"):
+    monkeypatch.setattr(trained, "FORMAT", 3)
+    with pytest.raises(ValueError, match=r"model\.npz: has format 4, .* reads up to 3; update it"):
         trained.phi(tmp_path / "again")
