@@ -70,7 +70,8 @@ class SkeletonOptions(MotionOptions):
     joints: Path | None = None
     """File that says which joint is which part, `left upper arm: Bone.012`, for names that are not known."""
     by_positions: bool = False
-    """Take where the joints are, and leave their rotations, which some programs turn about the bones as they like."""
+    """Take where the joints are, not how they are turned, which some programs choose as they like. Hands and toes stay
+    on their limbs."""
     allow: bool = False
     """Take a recording without arms or head, and a result that differs from the recording."""
     abduct: float = 0.0

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.body.plausibility import body_kinematics, joint_positions
 from clothjax.types import Body, Motion
-from data_prep import by_positions as positions
 from data_prep import rest_pose, skeleton
+from data_prep.by_positions import turns_from_t_pose
 from data_prep.doubts import ground
 from data_prep.recording import Capture, resample
 from data_prep.rest_pose import AXES, Figure, figure, is_rest_pose, turn_upright, unit
@@ -88,81 +88,59 @@ def retarget(
     up = _up(shown, of_file, rest, axes, about, allow, tell)
     shown = shown.turned(turn_upright(AXES[up], None if axes.forward is None else AXES[axes.forward]))
     if by_positions:
-        scale = leg_length(body.joints, of_body) / leg_length(shown.positions[0], of_file)
-        world = _by_positions(shown, of_file, body, of_body, names, _corrections(abduct, drop_clavicles))
-        return _placed(world, shown, scale, body, of_body, of_file, fps, allow, about, abduct + drop_clavicles, tell)
-    if rest is None:
-        frame = rest_pose.straightest(shown, of_file)
-        reference = rest_pose.standing(shown, resting, capture.parents, of_file, frame)
-        tell(f"its rest pose is no T-pose; trunk and shoulders are taken to be straight in frame {frame} of the result")
+        turned = turns_from_t_pose(shown.positions, of_file, body.joints, body.parents, names, of_body)
+        leg = leg_length(shown.positions[0], of_file)
     else:
-        reference = np.tile(rest_pose.rest_turn(resting, of_file, rest), (len(capture.names), 1, 1))
-    posed = figure(capture, relative(reference[None], capture.parents), np.zeros((1, 3))).positions[0]
+        if rest is None:
+            frame = rest_pose.straightest(shown, of_file)
+            reference = rest_pose.standing(shown, resting, capture.parents, of_file, frame)
+            tell(
+                "its rest pose is no T-pose; trunk and shoulders are taken to be straight in frame "
+                f"{frame} of the result"
+            )
+        else:
+            reference = np.tile(rest_pose.rest_turn(resting, of_file, rest), (len(capture.names), 1, 1))
+        posed = figure(capture, relative(reference[None], capture.parents), np.zeros((1, 3))).positions[0]
+        frozen = _beyond(body.parents, of_body) if freeze else set()
+        aligned = _aligned(body, of_body, posed, of_file)
+        turned = {
+            j: (aligned.get(j, np.eye(3)), shown.rotations[:, own] @ reference[own].T)
+            for j, own in _pairs(of_file, capture.names, of_body, names).items()
+            if j not in frozen
+        }
+        leg = leg_length(posed, of_file)
 
-    corrections = _corrections(abduct, drop_clavicles)
-    pairs = _pairs(of_file, capture.names, of_body, names)
-    frozen = _beyond(body.parents, of_body) if freeze else set()
-    part_of = {joint: part for part, joint in of_body.limbs.items()}
+    corrections, part_of = _corrections(abduct, drop_clavicles), {joint: part for part, joint in of_body.limbs.items()}
     world = np.zeros((len(shown.positions), len(names), 3, 3))
     for j, parent in enumerate(body.parents):
-        if j in frozen or j not in pairs:
-            world[:, j] = world[:, parent] if parent >= 0 else np.eye(3)
-            continue
-        own, part, align = pairs[j], part_of.get(j, ""), np.eye(3)
-        end = skeleton.end_of(part)
-        if end in of_file.limbs and end in of_body.limbs:
-            bone = body.joints[of_body.limbs[end]] - body.joints[j]
-            align = _between(bone, posed[of_file.limbs[end]] - posed[own])
-        world[:, j] = shown.rotations[:, own] @ reference[own].T @ corrections.get(part, np.eye(3)) @ align
-    _fill(world, of_body, pairs)
-
-    scale = leg_length(body.joints, of_body) / leg_length(posed, of_file)
-    return _placed(world, shown, scale, body, of_body, of_file, fps, allow, about, abduct + drop_clavicles, tell)
-
-
-def _by_positions(
-    shown: Figure,
-    of_file: Parts,
-    body: Body,
-    of_body: Parts,
-    names: tuple[str, ...],
-    corrections: dict[str, np.ndarray],
-) -> np.ndarray:
-    """Return the world rotations [T, J, 3, 3] of a body by where the joints of a recording are."""
-    turned = positions.world_rotations(shown.positions, of_file, body.joints, body.parents, names, of_body)
-    part_of = {joint: part for part, joint in of_body.limbs.items()}
-    world = np.tile(np.eye(3), (len(shown.positions), len(names), 1, 1))
-    for j, parent in enumerate(body.parents):
         if j in turned:
-            world[:, j] = turned[j] @ corrections.get(part_of.get(j, ""), np.eye(3))
-        elif parent >= 0:
-            world[:, j] = world[:, parent]
+            to_t_pose, from_there = turned[j]
+            world[:, j] = from_there @ corrections.get(part_of.get(j, ""), np.eye(3)) @ to_t_pose
+        else:
+            world[:, j] = world[:, parent] if parent >= 0 else np.eye(3)
     _fill(world, of_body, turned)
-    return world
 
-
-def _placed(
-    world: np.ndarray,
-    shown: Figure,
-    scale: float,
-    body: Body,
-    of_body: Parts,
-    of_file: Parts,
-    fps: float,
-    allow: bool,
-    about: str,
-    allowance: float,
-    tell: Callable[[str], object],
-) -> Motion:
-    """Return the motion of a body with world rotations [T, J, 3, 3] along a recording's path; `compare` it."""
+    scale = leg_length(body.joints, of_body) / leg
     path = shown.positions[:, of_file.hips]
     path = (path - path[0] * [1, 0, 1]) * scale - body.joints[0]
     motion = stand(Motion(relative(world, body.parents).astype(np.float32), path, float(fps)), body)
     for line in ground(float(path[0, 1] - motion.translation[0, 1])):
         tell(line)
     if not allow:
-        compare(motion, body, of_body, shown, of_file, about, allowance)
+        remedy = "" if by_positions else "--by-positions leaves the recording's rotations; "
+        compare(motion, body, of_body, shown, of_file, about, abduct + drop_clavicles, remedy)
     return motion
+
+
+def _aligned(body: Body, of_body: Parts, posed: np.ndarray, of_file: Parts) -> dict[int, np.ndarray]:
+    """Return by joint of a body the rotation [3, 3] of its bone to that of a recording in a T-pose [n, 3]."""
+    found = {}
+    for part, joint in of_body.limbs.items():
+        end = skeleton.end_of(part)
+        if part in of_file.limbs and end in of_file.limbs and end in of_body.limbs:
+            bone = body.joints[of_body.limbs[end]] - body.joints[joint]
+            found[joint] = _between(bone, posed[of_file.limbs[end]] - posed[of_file.limbs[part]])
+    return found
 
 
 def _up(
@@ -208,10 +186,10 @@ def _beyond(parents: np.ndarray, parts: Parts) -> set[int]:
     return {j for j in range(len(parents)) if ends & set(skeleton.ancestors(j, parents))}
 
 
-def _fill(world: np.ndarray, parts: Parts, pairs: Collection[int]) -> None:
+def _fill(world: np.ndarray, parts: Parts, turned: Collection[int]) -> None:
     """Turn the joints of a trunk that the file does not have in equal shares between those around them."""
     chain = parts.chain
-    moved = [k for k, joint in enumerate(chain) if joint in pairs]
+    moved = [k for k, joint in enumerate(chain) if joint in turned]
     for before, after in zip(moved, moved[1:], strict=False):
         start, end = (Rotation.from_matrix(world[:, chain[k]]) for k in (before, after))
         whole = (start.inv() * end).as_rotvec()
@@ -221,7 +199,14 @@ def _fill(world: np.ndarray, parts: Parts, pairs: Collection[int]) -> None:
 
 
 def compare(
-    motion: Motion, body: Body, of_body: Parts, shown: Figure, of_file: Parts, about: str, allowance: float
+    motion: Motion,
+    body: Body,
+    of_body: Parts,
+    shown: Figure,
+    of_file: Parts,
+    about: str,
+    allowance: float,
+    remedy: str,
 ) -> None:
     """Refuse a motion whose bones do not point where those of its recording do.
 
@@ -230,6 +215,7 @@ def compare(
         of_body, of_file: parts of the body and of the recording.
         shown: the recording, +y up.
         allowance: degrees by which arms may differ further, because that was asked for.
+        remedy: what else may help.
 
     Raises:
         ValueError: naming the part that differs most, with both directions.
@@ -259,7 +245,7 @@ def compare(
             f"{about}: the {worst} would be {medians[worst]:.0f} degrees off: in frame {frame} it points to "
             f"{np.round(recorded[worst][frame], 2).tolist()} in the recording, to "
             f"{np.round(found[worst][frame], 2).tolist()} in the result (x left, y up, z forward). "
-            "Check --up and --joints; --by-positions leaves the recording's rotations; --allow takes it all the same"
+            f"Check --up and --joints; {remedy}--allow takes it all the same"
         )
 
 
