@@ -206,7 +206,7 @@ def compare(
     of_file: Parts,
     about: str,
     allowance: float,
-    remedy: str,
+    remedy: str = "",
 ) -> None:
     """Refuse a motion whose bones do not point where those of its recording do.
 

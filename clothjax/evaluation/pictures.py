@@ -173,7 +173,9 @@ def film(write: Callable) -> Callable:
             for name, one in several.items()
         }
         floor = min(float(parts[0][..., 1].min()) for parts in tracks.values())
-        camera = ray_cast.camera_for(np.concatenate([parts[-1] for parts in tracks.values()]), margin=AROUND)
+        camera = ray_cast.camera_for(
+            np.concatenate([parts[-1] for parts in tracks.values()]), margin=AROUND, aspect=FILM[0] / FILM[1]
+        )
         pictures = []
         with progress_bar("rendering", len(first.root)) as report:
             for t in range(len(first.root)):
@@ -182,7 +184,7 @@ def film(write: Callable) -> Callable:
                     pairs = zip(tracks[name], one.parts, strict=True)
                     surfaces = [Surface(x[t], part.faces, part.colour, part.checked) for x, part in pairs]
                     each[name] = ray_cast.render(surfaces, camera, FILM, floor=floor)
-                pictures.append(ray_cast.beside(each) if len(each) > 1 else each[""])
+                pictures.append(ray_cast.beside(each) if isinstance(shown, dict) else each[""])
                 report(t + 1)
         write(out, pictures, first.fps)
 

@@ -32,8 +32,14 @@ class Camera(NamedTuple):
     height: float  # m, the height that is visible at the target
 
 
-def camera_for(vertices: np.ndarray, view: str = "three-quarter", margin: float = 1.12) -> Camera:
-    """Return a camera that sees all vertices [..., 3] m, from `front`, `back`, `side` or `three-quarter`.
+def camera_for(
+    vertices: np.ndarray, view: str = "three-quarter", margin: float = 1.12, aspect: float = np.inf
+) -> Camera:
+    """Return a camera that sees vertices [..., 3] m, from `front`, `back`, `side` or `three-quarter`.
+
+    Args:
+        margin: how much more than their height it sees.
+        aspect: width of the picture over its height, if it must hold all of their width too.
 
     Raises:
         ValueError: for another view.
@@ -44,7 +50,8 @@ def camera_for(vertices: np.ndarray, view: str = "three-quarter", margin: float 
     points = np.asarray(vertices, np.float64).reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
     target = 0.5 * (low + high)
-    height = margin * (high[1] - low[1])
+    width = np.ptp(points @ np.array([np.cos(angles[view]), 0.0, -np.sin(angles[view])]))
+    height = margin * max(high[1] - low[1], width / aspect)
     away = np.array([np.sin(angles[view]), 0.12, np.cos(angles[view])])
     return Camera(target + 4.0 * height * away / np.linalg.norm(away), target, height)
 
@@ -76,10 +83,6 @@ def render(
         places.append(np.ascontiguousarray(surface.vertices, np.float32))
         mesh_type(scene, places[-1], np.ascontiguousarray(surface.faces, np.int32))
         normals.append(vertex_normals(places[-1], surface.faces))
-    # of the front and of the back of each vertex
-    openings = [
-        np.stack([_open(scene, x, side * n) for side in (1, -1)], 1) for x, n in zip(places, normals, strict=True)
-    ]
     width, height = size[0] * samples, size[1] * samples
     origins, directions = _rays(camera, width, height)
     hit = scene.run(origins, directions, query="INTERSECT", output=1)
@@ -94,8 +97,12 @@ def render(
         corners = np.asarray(surface.faces)[hit["primID"][chosen]]
         u, v = hit["u"][chosen], hit["v"][chosen]
         weights = np.stack([1 - u - v, u, v], axis=1)
-        for found, values in ((points, places), (normal, normals), (opening, openings)):
-            found[chosen] = np.einsum("nk,nkc->nc", weights, values[index][corners])
+        seen = np.unique(corners)
+        openings = np.ones((len(places[index]), 2), np.float32)  # of the front and of the back of each vertex
+        for column, side in enumerate((1, -1)):
+            openings[seen, column] = _open(scene, places[index][seen], side * normals[index][seen])
+        for found, values in ((points, places[index]), (normal, normals[index]), (opening, openings)):
+            found[chosen] = np.einsum("nk,nkc->nc", weights, values[corners])
         base[chosen] = surface.colour
         if surface.checked is not None:
             base[chosen[_dark(np.asarray(surface.checked)[corners], weights)]] *= 0.8

@@ -38,6 +38,28 @@ def test_the_camera_frames_its_subject():
     assert 2 <= rows[0] <= 12 and 87 <= rows[-1] <= 97
 
 
+@pytest.mark.parametrize("view", ["front", "three-quarter", "side", "back"])
+def test_the_camera_holds_a_wide_subject_where_it_is_told_the_aspect(view):
+    vertices, faces = sheet()
+    wide = vertices * [1.0, 0.2, 1.0] + vertices[:, [2, 2, 0]] * [0, 0, 1.0]  # along x and z
+    camera = ray_cast.camera_for(wide, view, margin=1.3, aspect=0.5)  # what is nearer is larger
+    picture = ray_cast.render([Surface(wide, faces)], camera, (50, 100))
+    assert (picture[:, [0, -1]] == picture[0, 0]).all() and (picture != picture[0, 0]).any()
+
+
+def test_the_lights_go_around_with_the_camera():
+    """So that a subject that turns with it looks the same."""
+    vertices, faces = sheet()
+    bent = vertices + [0, 0, 0.1] * np.sin(6 * vertices[:, :1])
+    pictures = []
+    for view, angle in (("front", 0.0), ("side", np.pi / 2)):
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        turned = bent @ turn.T
+        camera = ray_cast.camera_for(turned, view)._replace(target=np.zeros(3))
+        pictures.append(ray_cast.render([Surface(turned, faces)], camera, (60, 60)).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1.5 and np.ptp(pictures[0]) > 60
+
+
 def test_an_unknown_view_is_refused():
     with pytest.raises(ValueError, match="view 'top' is not one of"):
         ray_cast.camera_for(np.zeros((3, 3)), "top")
