@@ -41,8 +41,10 @@ def test_the_camera_frames_its_subject():
 @pytest.mark.parametrize("view", ["front", "three-quarter", "side", "back"])
 def test_the_camera_holds_a_wide_subject_where_it_is_told_the_aspect(view):
     vertices, faces = sheet()
-    wide = vertices * [1.0, 0.2, 1.0] + vertices[:, [2, 2, 0]] * [0, 0, 1.0]  # along x and z
-    camera = ray_cast.camera_for(wide, view, margin=1.3, aspect=0.5)  # what is nearer is larger
+    turn = {"three-quarter": 0.6, "side": np.pi / 2}.get(view, 0.0)
+    wide = vertices * [1.0, 0.2, 1.0]
+    wide = wide @ np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+    camera = ray_cast.camera_for(wide, view, aspect=0.5)
     picture = ray_cast.render([Surface(wide, faces)], camera, (50, 100))
     assert (picture[:, [0, -1]] == picture[0, 0]).all() and (picture != picture[0, 0]).any()
 
