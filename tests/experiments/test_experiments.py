@@ -30,7 +30,7 @@ TOY = [
     "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
     "--labels.rounds", "2", "--labels.simulations", "2", "--labels.frames", "4", "--labels.descent-steps", "2",
-    "--labels.last-steps", "0", "--tuning.steps", "20", "--tuning.pool", "4",
+    "--labels.last-steps", "0", "--model.relaxation", "1", "--tuning.steps", "20", "--tuning.pool", "4",
 ]  # fmt: skip
 
 
