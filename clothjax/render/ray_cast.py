@@ -158,12 +158,12 @@ def comparison(path: str | Path | BinaryIO, rows: dict[str, Sequence[np.ndarray]
 
 
 def beside(pictures: dict[str, np.ndarray]) -> np.ndarray:
-    """Return pictures [h, w, 3] uint8 of one height side by side, each with its name at the top."""
+    """Return pictures [h, w, 3] uint8 of one height side by side, each with its name in the corner."""
     image, draw, font = _pillow("Image", "ImageDraw", "ImageFont")
     sheet = image.fromarray(np.concatenate(list(pictures.values()), axis=1))
     pen, letters, left = draw.Draw(sheet), font.load_default(20), 0
     for name, picture in pictures.items():
-        pen.text((left + picture.shape[1] / 2, 20), name, fill="black", font=letters, anchor="mm")
+        pen.text((left + 12, 12), name, fill="black", font=letters)
         left += picture.shape[1]
     return np.asarray(sheet)
 
