@@ -415,7 +415,7 @@ def moved(a, b, name):
 @pytest.mark.parametrize("anew", [False, True])
 def test_training_begins_anew_at_the_ridge_solution_where_it_is_to(toy, round_of, anew):
     """It always does before the first step and before the last training, in between if `anew`; then it goes on."""
-    config, state, data = learning(toy, round_of, steps=2, last_steps=2, anew=anew)
+    config, state, data = learning(toy, round_of, steps=2, last_steps=2, anew=anew, decay=0.0)
     solved, rate = begun(toy, round_of), config.labels.learning_rate
     take = partial(imitation.make_update, len(state.normalizers.low), 14, config, 1)
     rounds, last = take(), take(last=True)
