@@ -20,14 +20,11 @@ def turns_from_t_pose(
 
     Args:
         positions: [T, n, 3] of the recording, +y up.
-        parts: of the recording.
+        parts: of the recording, which has a spine or a neck.
         joints: [J, 3] m of the body in its canonical pose.
         parents: [J] of the body.
         names: [J] of its joints, CMU's.
         of_body: parts of the body.
-
-    Raises:
-        ValueError: for a recording without spine and neck.
     """
     to_t = to_t_pose(joints, parents, landmarks(names, parents))
     standing = np.zeros_like(joints)
@@ -47,8 +44,6 @@ def turns_from_t_pose(
 def _axes(positions: np.ndarray, parts: Parts) -> dict[str, np.ndarray]:
     """Return axes [T, 3, 3] of the parts of a figure by where its joints [T, n, 3] are."""
     limbs, chain = parts.limbs, parts.chain
-    if len(chain) < 2:
-        raise ValueError("without spine and neck its trunk is not seen: leave --by-positions out")
 
     def bone(start: int, end: int) -> np.ndarray:
         return unit(positions[:, end] - positions[:, start])

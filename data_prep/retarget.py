@@ -2,7 +2,8 @@
 
 World rotations of the joints are copied by body part (`skeleton.py`), relative to how the joints are turned when the
 figure stands like the body (`rest_pose.py`). Bones of arms and legs are aligned, so that an A-pose and a T-pose agree.
-The root's path is scaled by the length of a leg. At last the result is compared with the recording.
+Where it is asked for, rotations are found from positions (`by_positions.py`). The root's path is scaled by the length
+of a leg. At last the result is compared with the recording.
 """
 
 from collections.abc import Callable, Collection
@@ -88,6 +89,8 @@ def retarget(
     up = _up(shown, of_file, rest, axes, about, allow, tell)
     shown = shown.turned(turn_upright(AXES[up], None if axes.forward is None else AXES[axes.forward]))
     if by_positions:
+        if len(of_file.chain) < 2:
+            raise ValueError(f"{about}: it has neither spine nor neck, so its trunk is not seen: no --by-positions")
         turned = turns_from_t_pose(shown.positions, of_file, body.joints, body.parents, names, of_body)
         leg = leg_length(shown.positions[0], of_file)
     else:

@@ -539,6 +539,8 @@ def test_a_recording_without_a_head_is_taken_by_positions(rig, tmp_path):
     motion = retarget.retarget(without, *rig, parts, by_positions=True)
     turned = apart(motion, retarget.retarget(without, *rig, parts), rig)
     assert turned["LeftArm"] < 1 and turned["RightLeg"] < 1 and turned["Spine1"] < 5
+    with pytest.raises(ValueError, match=r"walk: it has neither spine nor neck"):
+        retarget.retarget(without, *rig, parts._replace(spine=(), neck=()), by_positions=True, about="walk", allow=True)
 
 
 def test_by_positions_is_an_option_of_the_program(tmp_path, monkeypatch):

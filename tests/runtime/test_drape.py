@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ from scipy.spatial.distance import cdist
 
 import clothjax as cj
 from clothjax.body import skinning
+from clothjax.config import Config
 from clothjax.evaluation import rollouts
-from clothjax.files import checkpoint, storage
+from clothjax.files import checkpoint, configuration, storage
 from clothjax.geometry.clusters import middles
 from clothjax.geometry.vectors import at_corners
 from clothjax.material import configured_material
@@ -422,3 +424,12 @@ def test_a_packed_model_of_before_forces_is_one_without_them(tmp_path):
     del settings["stage2"]["forces"]
     (folder / trained.CONFIG).write_text(yaml.safe_dump(settings))
     assert isinstance(trained.psi(folder).normalizers, normalisation.Normalizers)
+
+
+def test_a_run_of_before_forces_is_one_without_them(monkeypatch, tmp_path):
+    settings = configuration.to_dict(Config())
+    del settings["stage2"]["forces"]
+    monkeypatch.setattr(checkpoint, "steps", lambda folder: [])
+    monkeypatch.setattr(checkpoint, "latest", lambda folder: SimpleNamespace(config=settings))
+    monkeypatch.setattr(checkpoint, "read", lambda folder, *wanted: ({name: {} for name in wanted}, None))
+    assert not trained.network(tmp_path)[0].stage2.forces
