@@ -74,8 +74,7 @@ def _axes(positions: np.ndarray, parts: Parts) -> dict[str, np.ndarray]:
             found |= {name: _bases(each, axis) for name, each in zip(names, bones, strict=False)}
             toe = limbs.get(f"{side} toe")
             if upper == "thigh" and toe is not None:
-                foot = bone(end, toe)
-                found[names[2]] = _bases(foot, axis + np.cross(foot, bones[1]))
+                found[names[2]] = _bases(bone(end, toe), axis)
     return found
 
 

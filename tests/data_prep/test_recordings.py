@@ -525,6 +525,31 @@ def test_straight_limbs_are_turned_as_in_the_frames_around_or_a_t_pose(rig, tmp_
     assert all(turned[name] < 40 for name in ("LeftArm", "RightArm", "LeftUpLeg"))  # a straight limb does not show it
 
 
+def test_limbs_keep_their_turn_while_they_are_straight(rig, tmp_path):
+    """An arm that is turned about itself, is straight for a while, and hangs on a shrug; legs that kick."""
+    capture = bvh.read_bvh(dialect(tmp_path / "walk.bvh"))
+
+    def turned_by(name, axis, degrees, frames=slice(None)):
+        joint = capture.names.index(name)
+        capture.rotations[frames, joint] @= Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+    turned_by("RightArm", "x", 60)
+    turned_by("RightForeArm", "y", 50)
+    turned_by("RightShoulder", "z", -25)
+    capture.rotations[20:30, capture.names.index("RightForeArm")] = np.eye(3)
+    capture.rotations[20:25, [capture.names.index(name) for name in ("LeftLeg", "LeftFoot")]] = np.eye(3)
+    turned_by("LeftUpLeg", "x", -90, slice(20, 25))  # the foot points up
+    turned_by("RightUpLeg", "z", -60, slice(30, 35))  # the foot rolls with its leg
+    found = apart(
+        retarget.retarget(scrambled(capture), *rig, about="walk", by_positions=True),
+        retarget.retarget(capture, *rig),
+        rig,
+    )
+    assert found["RightArm"] < 10 and found["RightForeArm"] < 10
+    assert found["RightShoulder"] < 12  # of a shrug of 25; by rotations the bones of clavicles are not aligned
+    assert all(found[side + part] < 8 for side in ("Left", "Right") for part in ("UpLeg", "Leg", "Foot"))
+
+
 def test_a_recording_without_a_head_is_taken_by_positions(rig, tmp_path):
     capture = bvh.read_bvh(dialect(tmp_path / "walk.bvh"))
     kept = [j for j, name in enumerate(capture.names) if "Head" not in name]

@@ -89,6 +89,18 @@ def test_a_valley_is_darker_than_a_plain_and_a_far_wall_hides_nothing():
     assert middle(near) < 0.93 * middle() and middle(far) == middle()
 
 
+def test_each_side_of_a_sheet_has_its_own_sky():
+    """A wall behind it hides the sky of its back alone."""
+    vertices, faces = sheet(40)
+    wall = Surface(vertices[:, [2, 1, 0]] + [0.06, 0, -0.5], faces)
+
+    def middle(view, *others):
+        camera = ray_cast.camera_for(vertices, view)
+        return ray_cast.render([Surface(vertices, faces), *others], camera, (60, 60))[20:40, 30].astype(int).sum()
+
+    assert middle("front", wall) == middle("front") and middle("back", wall) < 0.93 * middle("back")
+
+
 def test_a_check_has_fields_of_one_size_on_the_cloth_at_rest():
     vertices, faces = sheet(40)
     camera = ray_cast.camera_for(vertices, "front")

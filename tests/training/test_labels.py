@@ -432,6 +432,17 @@ def test_training_begins_anew_at_the_ridge_solution_where_it_is_to(toy, round_of
         assert (drawn > 20 * rate) == begins, number
 
 
+def test_weights_decay_relative_to_the_rate(toy, round_of):
+    """In the first step, at the full rate, by `decay` times it: the linear map from its ridge solution."""
+    steps = []
+    for decay in (0.0, 4.0):
+        config, state, data = learning(toy, round_of, steps=2, decay=decay)
+        update = imitation.make_update(len(state.normalizers.low), 14, config, 1)
+        steps.append(update(data, jax.tree.map(jnp.array, state))[0].params["linear"]["kernel"])
+    shrunk = 4.0 * config.labels.learning_rate * begun(toy, round_of).params["linear"]["kernel"]
+    np.testing.assert_allclose(steps[0] - steps[1], shrunk, atol=1e-3 * np.abs(shrunk).max())
+
+
 @pytest.mark.slow
 def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of):
     """The code that a rollout stores is the one that labelling counts as Psi's."""
