@@ -178,6 +178,9 @@ class ModelConfig:
     relaxation: int = 0
     """Jacobi steps down the stretching energy that end the decoder. They let blend shapes fold without stretching. Only
     with `stage2.forces`."""
+    felt: str = ""
+    """The same garment with fewer vertices, by asset name or path. It is relaxed, and feels the forces, in place of the
+    garment itself, and is its level of detail. Empty: the garment itself. Only with `stage2.forces`."""
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
     remat: bool = False
@@ -456,6 +459,7 @@ class Config:
             self.stage2.forces or self.model.relaxation == 0,
             "model.relaxation needs stage2.forces: a Psi without forces does not know the cloth",
         )
+        _require(self.stage2.forces or not self.model.felt, "model.felt needs stage2.forces: nothing is felt without")
         _require(
             not self.stage2.forces or (self.physics.body == "moving" and not self.peer.network),
             "stage2.forces needs a body that moves (physics.body: moving), and is not of a baseline (peer.network)",

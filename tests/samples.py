@@ -347,13 +347,17 @@ class ForcePsi(NamedTuple):
     def model(self, **character):
         """Return the model of a character."""
         it = self.experiment
+        felt = None if it.scene.felt is None else it.scene.felt.garment
         return loading.build(
-            it.config, it.garment, it.body, it.names, self.garment, self.predictor, self.scales, **character
+            it.config, it.garment, it.body, it.names, self.garment, self.predictor, self.scales, felt=felt, **character
         )
 
 
-def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, **physics):
+def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, meshes=(), **physics):
     """A random Psi with forces whose code decays, within +-`limit`, with either a skip or a ReLU on the weights.
+
+    Args:
+        meshes: garment, and the garment that feels; by default that of `small`.
 
     The character scales its inputs and layers by random maps of size `scaled`; by default it does not.
     """
@@ -366,6 +370,9 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, **physics):
         stage2=dataclasses.replace(config.stage2, forces=True, hidden=(32, 24)),
         physics=dataclasses.replace(config.physics, **physics),
     )
+    if meshes:
+        garment, felt = meshes
+        config = dataclasses.replace(config, garment=garment, model=dataclasses.replace(config.model, felt=felt))
     experiment = assembly.assemble(config)
     scene, size, rng = experiment.scene, 40, np.random.default_rng(0)
     basis = 0.05 * laplacian_shapes.laplacian(scene, config)

@@ -207,6 +207,25 @@ def _closest(
     return v, w, best
 
 
+class OnMesh(NamedTuple):
+    """The points of a mesh that are nearest to other points."""
+
+    corners: Array  # [n, 3] int32, vertices of the nearest face, the one with the largest share first
+    shares: Array  # [n, 3] barycentric coordinates
+
+    def interpolated(self, values: Array) -> Array:
+        """Return values [n, C] at the points, from those [V, C] at the vertices."""
+        return jnp.sum(values[self.corners] * self.shares[:, :, None], axis=1)
+
+
+def on_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> OnMesh:
+    """Find the points of a mesh of `vertices` [V, 3] m and `faces` [F, 3] that are nearest to `points` [n, 3] m."""
+    face = np.asarray(jax.jit(nearest_face)(points, vertices[faces], patches(vertices, faces).groups))
+    shares = np.asarray(closest_on_triangle(points, vertices[faces[face]])[0])
+    order = np.argsort(-shares, axis=1, kind="stable")
+    return OnMesh(*(np.take_along_axis(rows, order, axis=1) for rows in (faces[face], shares)))
+
+
 def nearest_face_around(positions: Array, body: Array, patches: Patches, vertices: Sequence[Array]) -> Array:
     """Find the index [V] of the triangle of a mesh [B, 3] m nearest to each position [V, 3] m, from vertices near it.
 

@@ -14,7 +14,7 @@ from clothjax.networks.message_passing import Block
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.networks.psi import Psi, constant_inputs, next_code, window_inputs
-from clothjax.simulation.characters import Character, carried, surface
+from clothjax.simulation.characters import Character
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array
@@ -56,7 +56,7 @@ def baseline_animator(input_joints: np.ndarray) -> MakeAnimator:
 
     def make(model: dict, scene: Scene, character: Character, config: Config) -> Animator:
         constants = constant_inputs(character.betas, character.material, config.material)
-        free = phi.free(scene)
+        free = phi.free(scene.garment)
         network = baselines.network(config, len(free))
 
         def step(inputs: StepInput) -> StepOutput:
@@ -157,25 +157,10 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
         constants = constant_inputs(character.betas, character.material, config.material)
 
         def step(inputs: StepInput) -> StepOutput:
-            def skinned(code: Array) -> Array:
-                return phi.skinned(garment, scene, character, code, inputs.window, config.model)
-
-            held, change, position = jax.lax.stop_gradient(
-                (inputs.state.latent, inputs.state.change, inputs.state.position)
-            )
-            pulls = jax.lax.stop_gradient(
-                forces.reduced(
-                    skinned,
-                    held,
-                    carried(position, inputs.window),
-                    inputs.time_step,
-                    surface(scene, inputs.window.following),
-                    scene.clusters,
-                    scene.mesh,
-                    config.physics,
-                )
-            )
-            code = next_code(model["params"], scales, held, change, pulls, constants, config.stage2)
+            state = jax.lax.stop_gradient(inputs.state)
+            pulls = forces.on_code(garment, scene, character, state, inputs.window, config)
+            pulls = jax.lax.stop_gradient(pulls)
+            code = next_code(model["params"], scales, state.latent, state.change, pulls, constants, config.stage2)
             code += jax.lax.stop_gradient(jnp.clip(code, scales.low, scales.high) - code)
             return StepOutput(phi.decode(garment, scene, character, code, inputs.window, config.model), code)
 

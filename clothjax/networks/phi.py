@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from clothjax.body import skinning
 from clothjax.config import MaterialConfig, ModelConfig
 from clothjax.networks import decoder, graph_features, message_passing, mlp, normalisation
 from clothjax.networks.graph_features import Features
@@ -18,10 +19,10 @@ from clothjax.networks.normalisation import Statistics
 from clothjax.physics import relaxation
 from clothjax.physics.descent import descend, warm_start
 from clothjax.simulation import characters
-from clothjax.simulation.characters import Character, Window
+from clothjax.simulation.characters import Character, Frame, Window
 from clothjax.simulation.rollout import StepInput, StepOutput
 from clothjax.simulation.scene import Scene
-from clothjax.types import Array
+from clothjax.types import Array, Garment
 
 DESCENT_BOUND = 0.3  # length of a descent step, in units of the code
 
@@ -70,7 +71,7 @@ class Phi(nn.Module):
         if self.config.latent_update == "descent":
             self.param("inverse_hessian", nn.initializers.zeros, (self.garment.latent,) * 2)
         latent = guess + self.convolve(self.message_passing(seen))
-        return latent, self.garment(latent, free(self.scene))
+        return latent, self.garment(latent, free(self.scene.garment))
 
     def convolve(self, processed: Array) -> Array:
         """Convolve node latents [V, W] to a latent code [L]."""
@@ -80,9 +81,9 @@ class Phi(nn.Module):
         return x.reshape(-1)
 
 
-def free(scene: Scene) -> Array:
+def free(garment: Garment) -> Array:
     """Return [V]: 1 for a vertex that moves, 0 for one that is pinned."""
-    return jnp.where(jnp.asarray(scene.garment.pinned), 0.0, 1.0)
+    return jnp.where(jnp.asarray(garment.pinned), 0.0, 1.0)
 
 
 def observe(statistics: dict[str, Statistics], seen: Features) -> dict[str, Statistics]:
@@ -153,24 +154,48 @@ def decode(
     return shown(displacement(garment, scene, latent, config), scene, character, window, config)
 
 
-def skinned(
-    garment: Params, scene: Scene, character: Character, latent: Array, window: Window, config: ModelConfig
+def felt(
+    garment: Params, scene: Scene, character: Character, latent: Array, frame: Frame, config: ModelConfig
 ) -> Array:
-    """Decode a code [L] to the vertices [V, 3] m of the following frame, before relaxation; arguments of `decode`."""
-    displaced = displacement(garment, scene, latent, config)
-    return decoder.vertices(displaced, character.template, window.following.garment)
+    """Decode a code [L] to the garment that feels, [Vf, 3] m at a frame; arguments of `decode`."""
+    unrelaxed = skinned(displacement(garment, scene, latent, config), scene, character, frame)
+    return relaxed(unrelaxed, scene, character, config)
 
 
 def displacement(garment: Params, scene: Scene, latent: Array, config: ModelConfig) -> Array:
     """Decode a code [L] to the canonical displacement [V, 3] m."""
-    return mlp.apply(decoder.of(garment, config), garment, latent, free(scene))
+    return mlp.apply(decoder.of(garment, config), garment, latent, free(scene.garment))
+
+
+def skinned(displaced: Array, scene: Scene, character: Character, frame: Frame) -> Array:
+    """Return the garment that feels, [Vf, 3] m at a frame, before relaxation, of a displacement [V, 3] m."""
+    if scene.felt is None:
+        return decoder.vertices(displaced, character.template, frame.garment)
+    assert character.felt is not None and frame.felt is not None
+    return decoder.vertices(scene.felt.on_garment.interpolated(displaced), character.felt.template, frame.felt)
+
+
+def relaxed(position: Array, scene: Scene, character: Character, config: ModelConfig) -> Array:
+    """Return the garment that feels, [Vf, 3] m, after `model.relaxation` steps."""
+    if config.relaxation == 0:
+        return position
+    cloth, mesh = (scene.garment, scene.mesh) if scene.felt is None else (scene.felt.garment, scene.felt.mesh)
+    rest, material = character.rest if character.felt is None else character.felt.rest, character.material
+    mobility = relaxation.mobility(rest, material, mesh, free(cloth))
+    return relaxation.relaxed(position, mobility, rest, material, mesh, config.relaxation)
 
 
 def shown(displaced: Array, scene: Scene, character: Character, window: Window, config: ModelConfig) -> Array:
-    """Return the vertices [V, 3] m of the following frame, skinned and relaxed, of a displacement [V, 3] m."""
-    position = decoder.vertices(displaced, character.template, window.following.garment)
-    if config.relaxation == 0:
+    """Return the vertices [V, 3] m of the following frame, skinned and relaxed, of a displacement [V, 3] m.
+
+    Where another garment feels, it is relaxed, and this one takes part in that.
+    """
+    frame = window.following
+    unrelaxed = skinned(displaced, scene, character, frame)
+    position = relaxed(unrelaxed, scene, character, config)
+    if scene.felt is None:
         return position
-    mesh, rest, material = scene.mesh, character.rest, character.material
-    mobility = relaxation.mobility(rest, material, mesh, free(scene))
-    return relaxation.relaxed(position, mobility, rest, material, mesh, config.relaxation)
+    assert frame.felt is not None
+    moved = skinning.unapply_direction(frame.felt, position - unrelaxed)
+    displaced += scene.felt.of_garment.interpolated(moved)
+    return decoder.vertices(displaced, character.template, frame.garment)

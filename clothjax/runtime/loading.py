@@ -14,6 +14,7 @@ from clothjax.config import Config
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.geometry.clusters import Clusters
+from clothjax.geometry.proximity import OnMesh
 from clothjax.networks import forces, normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.physics import contact_search, energies, relaxation
@@ -21,6 +22,7 @@ from clothjax.runtime import trained
 from clothjax.runtime.models import (
     Bounds,
     Cloth,
+    Felt,
     ForcePredictor,
     Layer,
     Model,
@@ -29,6 +31,7 @@ from clothjax.runtime.models import (
     Wearer,
     in_float32,
 )
+from clothjax.simulation import scene
 from clothjax.types import Array, Body, Garment, Material, Mesh
 
 FORCE_SLACK = 0.0125  # of the range of a code of a Psi with forces, a tenth of a deviation: how far out is still inside
@@ -43,6 +46,7 @@ def build(
     predictor: dict,
     normalizers: Normalizers | ForceScales,
     *,
+    felt: Garment | None = None,
     betas: Array | None = None,
     material: Material | None = None,
 ) -> Model:
@@ -55,6 +59,7 @@ def build(
         garment_params: parameters of the decoder with its blend shapes.
         predictor: parameters of the latent predictor.
         normalizers: scales of its codes and inputs.
+        felt: that of `model.felt`, if it is not the garment itself.
         betas: [S] body shape; default the mean body.
         material: default the configured one.
 
@@ -68,13 +73,16 @@ def build(
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
     touched = mesh = clusters = None
+    feels = garment if felt is None else felt
     if isinstance(normalizers, ForceScales):
         touched = reach.reachable(body, garment, config.physics.reach)
-        mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
-        clusters = contact_search.clusters(garment, touched, forces.touching_edges(mesh, config.physics))
+        mesh = topology.free_mesh(np.asarray(feels.faces), np.asarray(feels.pinned))
+        clusters = contact_search.clusters(feels, touched, forces.touching_edges(mesh, config.physics))
+    on_each_other = None if felt is None else scene.placed(felt, garment)
     network, wearer = _arrays(
-        garment, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas, material, config
-    )
+        garment, felt, on_each_other, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas,
+        material, config,
+    )  # fmt: skip
     model = Model(
         network=network,
         wearer=wearer,
@@ -91,6 +99,8 @@ def build(
 @partial(jax.jit, static_argnames="config")
 def _arrays(
     garment: Garment,
+    felt: Garment | None,
+    on_each_other: tuple[OnMesh, OnMesh] | None,
     body: Body,
     touched: Body | None,
     clusters: Clusters | None,
@@ -105,6 +115,8 @@ def _arrays(
     """Build the arrays of a model in one compiled program, which starts faster than many small ones.
 
     Args:
+        felt: the garment that feels, if it is not the one that is shown, and ...
+        on_each_other: ... where it lies on that one, and that one on it.
         touched: the part of the body that is felt, ...
         clusters: ... its faces and the garment's vertices and edges in clusters, and ...
         mesh: ... the elements that feel; None without forces.
@@ -115,13 +127,16 @@ def _arrays(
     bias, cloth, latent = jnp.zeros(0), None, None
     if isinstance(normalizers, ForceScales):
         assert touched is not None and clusters is not None and mesh is not None
-        rest, areas = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, mesh)
+        feels = garment if felt is None else felt
+        felt_template = skinning.shaped_vertices(feels, betas)
+        rest, areas = energies.cloth_measures(feels, felt_template if config.physics.shaped_rest else None, mesh)
         shaped = skinning.shaped_vertices(touched, betas)
         mobility = None
         if config.model.relaxation > 0:
-            free = 1.0 - jnp.asarray(garment.pinned, jnp.float32)
+            free = 1.0 - jnp.asarray(feels.pinned, jnp.float32)
             mobility = relaxation.mobility(rest, material, mesh, free)
-        cloth = Cloth(constants, areas * material.density, rest, material, shaped, mobility, None)
+        own_template = None if felt is None else felt_template.T
+        cloth = Cloth(constants, areas * material.density, rest, material, shaped, mobility, own_template)
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
         predictor = psi.of_character(predictor, psi.scaled_inputs(normalizers, constants))
@@ -147,6 +162,11 @@ def _arrays(
     if latent is not None:
         read = Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel)
     shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
+    if felt is not None and isinstance(parts, ForcePredictor):
+        assert on_each_other is not None
+        on_garment, of_garment = on_each_other
+        of_felt = jax.vmap(on_garment.interpolated)(shapes)
+        parts = parts._replace(felt=Felt(_flat(of_felt), jnp.asarray(felt.weights).T, *of_garment))
     network = Network(
         predictor=parts,
         code_bounds=bounds,
@@ -154,10 +174,15 @@ def _arrays(
         read=read,
         decoder=tuple(decoder),
         mix=None,
-        shapes=jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1),
+        shapes=_flat(shapes),
         weights=jnp.asarray(garment.weights).T,
     )
     return network, Wearer(bias, template.T, skinning.shaped_joints(body, betas), known, cloth)
+
+
+def _flat(shapes: Array) -> Array:
+    """Return blend shapes [K, V, 3] as rows [K, 3 V], coordinate by coordinate."""
+    return jnp.swapaxes(shapes, 1, 2).reshape(len(shapes), -1)
 
 
 def _layers(mlp: dict) -> list[Layer]:
@@ -203,14 +228,16 @@ def load(run: str | Path, *, betas: Array | None = None, material: Material | No
     """
     run_psi = trained.psi(trained.find(run))
     body, names = storage.load_rig(run_psi.config.body)
+    config = run_psi.config
     return build(
-        run_psi.config,
-        storage.load_garment(run_psi.config.garment, body),
+        config,
+        storage.load_garment(config.garment, body),
         body,
         names,
         run_psi.garment,
         run_psi.predictor,
         run_psi.normalizers,
+        felt=storage.load_garment(config.model.felt, body) if config.model.felt else None,
         betas=betas,
         material=material,
     )

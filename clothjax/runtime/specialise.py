@@ -227,16 +227,10 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
         raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))
-    own, faces = np.asarray(model.wearer.template).T, np.asarray(model.faces)
-    groups = proximity.patches(own, faces).groups
-    face = np.asarray(jax.jit(proximity.nearest_face)(template, own[faces], groups))
-    weights = np.asarray(proximity.closest_on_triangle(template, own[faces[face]])[0])
-    corners = np.asarray(_rows(model.network))[:, :, faces[face]]
-    shapes = np.einsum("kcvi,vi->kcv", corners, weights)
-    shapes[:, :, np.asarray(garment.pinned)] = 0.0
-    nearest_first = np.argsort(-weights, axis=1, kind="stable")
-    around, shares = (np.take_along_axis(rows, nearest_first, axis=1) for rows in (faces[face], weights))
-    model = _feeling_apart(model, around, np.where(np.asarray(garment.pinned)[:, None], 0.0, shares))
+    around, shares = proximity.on_mesh(template, np.asarray(model.wearer.template).T, np.asarray(model.faces))
+    shares = np.where(np.asarray(garment.pinned)[:, None], 0.0, shares)
+    shapes = np.einsum("kcvi,vi->kcv", np.asarray(_rows(model.network))[:, :, around], shares)
+    model = _feeling_apart(model, around, shares)
     network = model.network._replace(
         shapes=jnp.asarray(shapes.reshape(len(shapes), -1)),
         weights=jnp.asarray(garment.weights).T[np.array(model.moving)],

@@ -37,7 +37,8 @@ def assemble(config: Config) -> Experiment:
     """
     body, names = storage.load_rig(config.body)
     garment = storage.load_garment(config.garment, body)
-    return Experiment(config, names, body, garment, scene.build_scene(garment, body, config))
+    felt = storage.load_garment(config.model.felt, body) if config.model.felt else None
+    return Experiment(config, names, body, garment, scene.build_scene(garment, body, config, felt))
 
 
 def dress(experiment: Experiment, betas: Array | np.ndarray, material: Material) -> Character:

@@ -10,7 +10,15 @@ from clothjax.body import rotation, skinning
 from clothjax.config import PhysicsConfig
 from clothjax.physics import contact_search, energies
 from clothjax.simulation.scene import Scene
-from clothjax.types import Array, Material, Pose, Rest
+from clothjax.types import Array, Garment, Material, Mesh, Pose, Rest
+
+
+class Worn(NamedTuple):
+    """A garment as a character wears it."""
+
+    template: Array  # [V, 3] m, shaped, in the canonical pose
+    rest: Rest
+    mass: Array  # [V] kg
 
 
 class Character(NamedTuple):
@@ -23,6 +31,7 @@ class Character(NamedTuple):
     mass: Array  # [V] kg
     material: Material
     betas: Array  # [S]
+    felt: Worn | None = None  # of `Scene.felt`
 
 
 class Frame(NamedTuple):
@@ -33,6 +42,7 @@ class Frame(NamedTuple):
     normals: Array  # [B, 3] unit normals of the body's vertices
     root: Array  # [3] m, place of the root joint
     heading: Array  # [3, 3] rotation about +Y, from ahead to where the root faces
+    felt: Array | None  # [Vf, 3, 4] skinning transforms of the vertices of `Scene.felt`
 
 
 class Window(NamedTuple):
@@ -54,25 +64,29 @@ def dress(scene: Scene, betas: Array | None, material: Material, config: Physics
     if betas is None:
         betas = jnp.zeros(scene.body.shapedirs.shape[-1])
         with jax.ensure_compile_time_eval():
-            template, body, joints, rest, areas = _shape(scene, betas, config)
+            cloth, body, joints, felt = _shape(scene, betas, config)
     else:
-        template, body, joints, rest, areas = _shape(scene, betas, config)
-    return Character(template, body, joints, rest, mass=areas * material.density, material=material, betas=betas)
+        cloth, body, joints, felt = _shape(scene, betas, config)
+    if felt is not None:
+        felt = felt._replace(mass=felt.mass * material.density)
+    return Character(cloth.template, body, joints, cloth.rest, cloth.mass * material.density, material, betas, felt)
 
 
-def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Array, Array, Array, Rest, Array]:
-    """Return template, body, joints, rest measures and vertex areas [V] m^2 of a shape.
+def _shape(scene: Scene, betas: Array, config: PhysicsConfig) -> tuple[Worn, Array, Array, Worn | None]:
+    """Return the garment, body and joints of a shape, and the garment that is felt, both with areas for masses.
 
     Rest measures and areas are weighted by the garment's cloth.
     """
-    template = skinning.shaped_vertices(scene.garment, betas)
-    rest, areas = energies.cloth_measures(scene.garment, template if config.shaped_rest else None, scene.mesh)
+
+    def worn(garment: Garment, mesh: Mesh) -> Worn:
+        template = skinning.shaped_vertices(garment, betas)
+        return Worn(template, *energies.cloth_measures(garment, template if config.shaped_rest else None, mesh))
+
     return (
-        template,
+        worn(scene.garment, scene.mesh),
         skinning.shaped_vertices(scene.body, betas),
         skinning.shaped_joints(scene.body, betas),
-        rest,
-        areas,
+        None if scene.felt is None else worn(scene.felt.garment, scene.felt.mesh),
     )
 
 
@@ -96,6 +110,7 @@ def frame(scene: Scene, character: Character, pose: Pose) -> Frame:
         normals=normals,
         root=character.joints[root] + pose.translation,
         heading=rotation.heading(pose.rotations[root]),
+        felt=None if scene.felt is None else skinning.blend(scene.felt.garment.weights, transforms),
     )
 
 

@@ -9,7 +9,7 @@ from clothjax.body import reach
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import Patches, patches
+from clothjax.geometry.proximity import OnMesh, Patches, on_mesh, patches
 from clothjax.physics import contact_search
 from clothjax.types import Array, Body, Garment, Mesh
 
@@ -19,6 +19,16 @@ class Table(NamedTuple):
 
     ids: Array  # [P, K] int32, padded with the number of inputs
     mask: Array  # [P, K] bool
+
+
+class Felt(NamedTuple):
+    """The garment of `model.felt`: it is relaxed, and feels the forces."""
+
+    garment: Garment
+    mesh: Mesh  # as of `Scene`
+    clusters: Clusters | None  # likewise, of this garment's vertices
+    on_garment: OnMesh  # where this garment's vertices lie on the scene's; pinned ones have no shares in it
+    of_garment: OnMesh  # where the scene's garment's vertices lie on this one; likewise
 
 
 class Scene(NamedTuple):
@@ -34,6 +44,7 @@ class Scene(NamedTuple):
     patches: Patches | None  # of the body
     clusters: Clusters | None  # of the garment's vertices, and of the centroids of the body's faces
     garment_patches: Patches
+    felt: Felt | None = None  # None where the garment itself feels
 
     @property
     def touchable(self) -> bool:
@@ -41,8 +52,11 @@ class Scene(NamedTuple):
         return self.patches is not None
 
 
-def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
+def build_scene(garment: Garment, body: Body, config: Config, felt: Garment | None = None) -> Scene:
     """Build the scene of a garment on a body; deterministic.
+
+    Args:
+        felt: that of `model.felt`, if it is not the garment itself.
 
     Raises:
         ValueError: if the body is not near the garment, or a coarse level of `model.processor` would be empty.
@@ -79,7 +93,27 @@ def build_scene(garment: Garment, body: Body, config: Config) -> Scene:
         patches=patches(np.asarray(within.vertices), np.asarray(within.faces)) if touchable else None,
         clusters=contact_search.clusters(garment, within) if touchable else None,
         garment_patches=patches(np.asarray(garment.vertices), faces),
+        felt=None if felt is None else _felt(felt, garment, within if touchable else None),
     )
+
+
+def placed(felt: Garment, garment: Garment) -> tuple[OnMesh, OnMesh]:
+    """Return where a garment that feels lies on the one that is shown, and that one on it, in the canonical pose.
+
+    Pinned vertices have no shares in the other's displacement.
+    """
+
+    def on(one: Garment, other: Garment) -> OnMesh:
+        found = on_mesh(*(np.asarray(x) for x in (one.vertices, other.vertices, other.faces)))
+        return found._replace(shares=np.where(np.asarray(one.pinned)[:, None], 0.0, found.shares))
+
+    return on(felt, garment), on(garment, felt)
+
+
+def _felt(felt: Garment, garment: Garment, within: Body | None) -> Felt:
+    mesh = topology.free_mesh(np.asarray(felt.faces), np.asarray(felt.pinned))
+    clusters = None if within is None else contact_search.clusters(felt, within)
+    return Felt(felt, mesh, clusters, *placed(felt, garment))
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:

@@ -114,19 +114,15 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             (state, lag), (poses, key) = carry, inputs
             window = characters.window(scene, character, poses)
             step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config, external)
-            held, now = state.latent, characters.carried(state.position, window)
+            held = state.latent
 
             def garment(code: Array) -> Array:
                 return phi.decode(policy.garment, scene, character, code, window, config.model)
 
-            def skinned(code: Array) -> Array:
-                return phi.skinned(policy.garment, scene, character, code, window, config.model)
-
             def potential(new: Array) -> Array:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
-            surface = characters.surface(scene, window.following)
-            pulls = forces.reduced(skinned, held, now, step, surface, scene.clusters, scene.mesh, config.physics)
+            pulls = forces.on_code(policy.garment, scene, character, state, window, config, external)
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code, code + SAME * lag])

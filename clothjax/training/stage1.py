@@ -159,7 +159,7 @@ def rest_inverse_hessian(garment: dict, scene: Scene, config: Config) -> Array:
     network = decoder.of(garment, config.model)
 
     def energy_of_code(latent):
-        return energy(mlp.apply(network, garment, latent, phi.free(scene)))
+        return energy(mlp.apply(network, garment, latent, phi.free(scene.garment)))
 
     return descent.regularised_inverse(
         descent.hessian(energy_of_code, jnp.zeros(network.latent)), config.model.descent_damping

@@ -24,8 +24,8 @@ from clothjax.networks import animators, normalisation, phi
 from clothjax.physics import contact_search, energies
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import drape, inference, loading, specialise, trained
-from clothjax.simulation import assembly, characters, rollout
-from clothjax.types import ClothState, Material, Motion, Pose
+from clothjax.simulation import assembly, characters, rollout, time_step
+from clothjax.types import ClothState, Contact, Material, Motion, Pose
 
 FRAMES = 12
 
@@ -55,13 +55,19 @@ def relaxing():
     return random_force_psi(relaxation=3)
 
 
+@pytest.fixture(scope="module")
+def coarse():
+    """The garment that feels has a quarter of the vertices."""
+    return random_force_psi(relaxation=3, meshes=("skirt_4000", "skirt_1000"))
+
+
 def stiff(model):
     """The same model without relaxation."""
     cloth = model.wearer.cloth._replace(mobility=None)
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.parametrize("kind", ["forced", "relaxing"])
+@pytest.mark.parametrize("kind", ["forced", "relaxing", "coarse"])
 def test_it_is_the_animator_of_training(kind, motion, request):
     """Frame by frame from the same state, over a dance."""
     forced = request.getfixturevalue(kind)
@@ -76,15 +82,61 @@ def test_it_is_the_animator_of_training(kind, motion, request):
     advance = jax.jit(lambda state, poses: rollout.advance(animator, scene, character, state, poses, config)[0])
     state, moved = inference.initial_state(model, pose(motion, 1)), []
     for frame in range(FRAMES - 2):
-        hung = state.drape
+        hung, poses = state.drape, jax.tree.map(lambda x, frame=frame: x[frame], windows)
         before = ClothState(hung.position, hung.velocity, 0 * hung.velocity, state.latent, hung.change)
-        expected = advance(before, jax.tree.map(lambda x, frame=frame: x[frame], windows))
+        if scene.felt is not None:  # the garment that is shown has a place of its own
+            window = characters.window(scene, character, poses)
+            before = time_step.start(character, window, len(state.latent))._replace(latent=state.latent, change=hung.change)
+        expected = advance(before, poses)
         state, _ = inference.step(model, state, pose(motion, frame + 2))
-        np.testing.assert_allclose(state.latent, expected.latent, atol=2e-5)
-        np.testing.assert_allclose(state.drape.position, expected.position, atol=2e-5)
-        np.testing.assert_allclose(state.drape.velocity, expected.velocity, atol=2e-5)
+        if scene.felt is not None:
+            place = phi.felt(forced.garment, scene, character, state.latent, window.following, config.model)
+            place -= poses.translation[2][None]
+            np.testing.assert_allclose(state.drape.position, place, atol=2e-5)
+            if frame > 0:  # it rests at first, where in training it moves with the body
+                np.testing.assert_allclose(state.latent, expected.latent, atol=2e-5)
+        else:
+            np.testing.assert_allclose(state.latent, expected.latent, atol=2e-5)
+            np.testing.assert_allclose(state.drape.position, expected.position, atol=2e-5)
+            np.testing.assert_allclose(state.drape.velocity, expected.velocity, atol=2e-5)
         moved.append(np.abs(state.drape.change).max())
     assert min(moved) > 1e-3  # it does not merely hold the code
+
+
+def test_what_is_shown_takes_part_in_the_relaxation_of_what_feels(coarse, motion):
+    """As in training, where nothing is touched."""
+    model, experiment = coarse.model(), coarse.experiment
+    config, scene = experiment.config, experiment.scene
+    character = characters.dress(
+        scene, jnp.zeros(10), jax.tree.map(jnp.float32, configured_material(config)), config.physics
+    )
+    window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
+    code = 0.5 * jax.random.normal(jax.random.key(2), model.network.code_bounds.low.shape)
+    twice = dataclasses.replace(config.model, relaxation=6)  # as what is pushed out is relaxed too
+    expected = phi.decode(coarse.garment, scene, character, code, window, twice)
+    rotations, joints = skinning.forward_kinematics(
+        pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
+    )
+    transforms = inference._transforms(model, rotations, joints)
+    hung = drape.begin(model, code, transforms)
+    count = len(hung.position), len(model.network.predictor.mesh.edges)
+    far = [jnp.full((n, 3), -9.0) for n in count]
+    up = [jnp.zeros_like(x).at[:, 1].set(1.0) for x in far]
+    planes = [Contact(x, x, n, n, jnp.zeros(len(x), jnp.int32)) for x, n in zip(far, up)]
+    touched = drape.Touched(*planes, jnp.ones(count[1], bool))
+    found = drape.shown_outside(model, code, hung, touched, transforms)
+    root = np.asarray(motion.translation[2] - motion.translation[1])
+    np.testing.assert_allclose(found, expected - root[None], atol=3e-5)
+    unrelaxed = drape.shown(model, code, transforms)
+    assert 1e-3 < np.abs(np.asarray(found - unrelaxed)).max() < 0.05
+
+
+def test_the_same_mesh_in_the_place_of_its_own_changes_nothing(motion):
+    own, felt = (random_force_psi(relaxation=3, meshes=("skirt_1000", name)) for name in ("", "skirt_1000"))
+    assert felt.experiment.scene.felt is not None and own.experiment.scene.felt is None
+    one, other = (inference.animate(it.model(), motion)[0] for it in (own, felt))
+    assert np.abs(np.asarray(one[-1] - one[0])).max() > 0.01
+    np.testing.assert_allclose(one, other, atol=1e-3)
 
 
 def test_vertices_are_its_garment_in_the_world_outside_of_what_it_touches(forced, model, motion):
