@@ -344,12 +344,15 @@ class ForcePsi(NamedTuple):
     predictor: dict
     scales: ForceScales
 
-    def model(self, **character):
-        """Return the model of a character."""
+    def model(self, coarse=False, **character):
+        """Return the model of a character, which may show the garment that feels."""
         it = self.experiment
         felt = None if it.scene.felt is None else it.scene.felt.garment
+        config, decoder, garment = it.config, self.garment, it.garment
+        if coarse:
+            config, decoder, garment, felt = (*loading.as_felt(config, decoder, garment, felt), None)
         return loading.build(
-            it.config, it.garment, it.body, it.names, self.garment, self.predictor, self.scales, felt=felt, **character
+            config, garment, it.body, it.names, decoder, self.predictor, self.scales, felt=felt, **character
         )
 
 

@@ -215,29 +215,43 @@ def crowd(models: Sequence[Model]) -> Model:
     return dataclasses.replace(models[0], wearer=wearers)
 
 
-def load(run: str | Path, *, betas: Array | None = None, material: Material | None = None) -> Model:
+def load(
+    run: str | Path, *, betas: Array | None = None, material: Material | None = None, coarse: bool = False
+) -> Model:
     """Load the model of a finished run, or of a garment that comes with the library.
 
     Args:
         run: the folder of a run or of a packed model, or a name from `trained.shipped()`, such as "skirt".
         betas: [S] body shape; default the mean body.
         material: default the configured one.
+        coarse: show the garment of `model.felt`, a level of detail. Both have the same states, so that a scene can
+            change from one to the other in any frame.
 
     Raises:
-        ValueError: if the run has no readable checkpoint of stage 2, or its assets are not found.
+        ValueError: if the run has no readable checkpoint of stage 2, its assets are not found, or it is to be coarse
+            and has no `model.felt`.
     """
-    run_psi = trained.psi(trained.find(run))
-    body, names = storage.load_rig(run_psi.config.body)
-    config = run_psi.config
-    return build(
-        config,
-        storage.load_garment(config.garment, body),
-        body,
-        names,
-        run_psi.garment,
-        run_psi.predictor,
-        run_psi.normalizers,
-        felt=storage.load_garment(config.model.felt, body) if config.model.felt else None,
-        betas=betas,
-        material=material,
-    )
+    config, decoder, *parts = trained.psi(trained.find(run))
+    body, names = storage.load_rig(config.body)
+    garment = storage.load_garment(config.garment, body)
+    felt = storage.load_garment(config.model.felt, body) if config.model.felt else None
+    if coarse:
+        if felt is None:
+            raise ValueError(f"{run}: has no coarse mesh: it was trained without model.felt")
+        config, decoder, garment, felt = (*as_felt(config, decoder, garment, felt), None)
+    return build(config, garment, body, names, decoder, *parts, felt=felt, betas=betas, material=material)
+
+
+def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> tuple[Config, dict, Garment]:
+    """Return the configuration, decoder and garment of a model that shows the garment that feels.
+
+    Args:
+        decoder: parameters of the decoder of `garment`.
+        felt: that of `model.felt`.
+    """
+    on_garment, _ = scene.placed(felt, garment)
+    free = 1.0 - jnp.asarray(garment.pinned, jnp.float32)
+    shapes = jax.vmap(on_garment.interpolated)(decoder["blendshapes"] * free[None, :, None])
+    model = dataclasses.replace(config.model, felt="")
+    config = dataclasses.replace(config, garment=config.model.felt, model=model)
+    return config, decoder | {"blendshapes": shapes}, felt

@@ -1,7 +1,5 @@
 """Labelled frames: where the descent takes the states of simulations that Psi moves (DAgger, Ross et al. 2011)."""
 
-import json
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -218,17 +216,6 @@ def make_collect(
         return Round(simulations, Labels(*(part[rows] for part in flat)))
 
     return collect
-
-
-def fingerprint(settings: dict, params: dict) -> int:
-    """Return a number that tells labels of other settings, or of another Phi, apart.
-
-    Args:
-        settings: those that labels depend on, as `configuration.to_dict` gives them.
-        params: of Phi.
-    """
-    leaves = jax.tree.leaves((params["garment"], params["inverse_hessian"]))
-    return zlib.crc32(b"".join([json.dumps(settings).encode(), *(np.asarray(leaf).tobytes() for leaf in leaves)]))
 
 
 def save(finished: Round, path: Path, of: int) -> None:

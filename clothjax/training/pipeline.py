@@ -4,6 +4,7 @@ A stage with a checkpoint at its last step is read, not trained again. A stage w
 it. Any other stage starts anew. The first checkpoint of stage 1 contains the blend shapes and the preconditioner.
 """
 
+import shutil
 import time
 from collections.abc import Callable
 from functools import partial
@@ -134,17 +135,27 @@ def train_phi(run: Run) -> loop.Fitted:
     """Run stage 1: prepare blend shapes and preconditioner, then train Phi on the physics; return it, finished."""
     scene, config = run.experiment.scene, run.config
     began, new = time.monotonic(), not run.steps("stage1")
-    state = stage1.init(scene, run.clips, config, _principal_shapes(run) if new else None)
+    # the simulations of hours survive a process that is ended; they are not needed after the first checkpoint
+    simulated = run.directory / f"simulated_{run_folder.fingerprint(_read_by('stage1', config))}"
+    shapes, hessians = (None, None) if jax.process_count() > 1 else (simulated / "shapes", simulated / "hessians")
+    for folder in (shapes, hessians) if new else ():
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+    state = stage1.init(scene, run.clips, config, _principal_shapes(run, shapes) if new else None)
     if new and config.model.latent_update == "descent" and config.model.descent_samples > 0:
         model = {"params": state.params, "statistics": state.statistics}
         with progress_bar("preconditioning", config.model.descent_samples) as report:
-            inverse = preconditioner.measure(model, scene, run.clips, config, report, run.device_mesh)
+            inverse = preconditioner.measure(model, scene, run.clips, config, report, run.device_mesh, hessians)
         state = stage1.preconditioned(state, inverse)
     if new:
         _add_seconds(run, start_seconds=time.monotonic() - began)
     progress.say(f"stage 1: Phi on the physics, {config.stage1.steps} steps")
     update = stage1.make_curriculum(scene, run.clips, config, STEPS_PER_CALL, run.device_mesh)
-    return _fit(run, "stage1", update, state, config.stage1.steps, f"stage 1, {config.garment}")
+    fitted = _fit(run, "stage1", update, state, config.stage1.steps, f"stage 1, {config.garment}")
+    if jax.process_index() == 0:
+        for folder in run.directory.glob("simulated_*"):
+            shutil.rmtree(folder)
+    return fitted
 
 
 def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]]:
@@ -197,10 +208,7 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     progress.say(f"stage 2: the latent predictor with forces, {settings.rounds} rounds of {settings.steps} steps")
     if run.steps("tuning") and done < settings.all_steps:
         raise ValueError(f"{run.directory / 'tuning'} belongs to a stage 2 that is no longer there: remove it")
-    settings_read = {
-        name: value for name, value in configuration.to_dict(config).items() if name not in MAY_DIFFER["stage2"]
-    }
-    of = labels.fingerprint(settings_read, params)
+    of = run_folder.fingerprint(_read_by("stage2", config), jax.tree.leaves((garment, inverse)))
     collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
     update = imitation.make_update(len(inverse), len(constants), config, STEPS_PER_CALL, run.device_mesh)
     state = imitation.blank(garment, whitening, len(constants), config)
@@ -294,14 +302,23 @@ def _fit(
     )
 
 
-def _principal_shapes(run: Run) -> np.ndarray | None:
-    """Return principal shapes [K, V, 3] m, or None if the configuration asks for smooth ones."""
+def _read_by(stage: str, config: Config) -> dict:
+    """Return the settings that a stage reads."""
+    return {name: value for name, value in configuration.to_dict(config).items() if name not in MAY_DIFFER[stage]}
+
+
+def _principal_shapes(run: Run, folder: Path | None = None) -> np.ndarray | None:
+    """Return principal shapes [K, V, 3] m, or None if the configuration asks for smooth ones.
+
+    Args:
+        folder: where the simulations are kept.
+    """
     sequences = run.config.shapes.sequences
     if sequences == 0:
         return None
     progress.say(f"blend shapes: from {sequences} rollouts of cloth that the physics moves")
     with progress_bar("simulating", sequences) as report:
-        frames = principal_shapes.simulate(run.experiment.scene, run.clips, run.config, report, run.device_mesh)
+        frames = principal_shapes.simulate(run.experiment.scene, run.clips, run.config, report, run.device_mesh, folder)
     return principal_shapes.principal(frames, run.experiment.scene, run.config)
 
 

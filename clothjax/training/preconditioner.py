@@ -1,6 +1,7 @@
 """Preconditioner of Phi's descent: the inverse of its potential's mean Hessian over states of rollouts."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ def measure(
     config: Config,
     progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
+    folder: Path | None = None,
 ) -> np.ndarray:
     """Measure the inverse mean Hessian [L, L] in 1/J at the ends of `model.descent_samples` short rollouts of Phi.
 
@@ -36,6 +38,7 @@ def measure(
         model: Phi's `params`, with any preconditioner, and `statistics`.
         progress: called with the number of rollouts done.
         device_mesh: each device rolls out a part of them.
+        folder: where they are kept, and read, if they are there.
 
     Raises:
         ValueError: if no rollout stayed finite.
@@ -58,7 +61,7 @@ def measure(
 
     clips = jax.tree.map(jnp.asarray, clips)
     keys = sampling.keys(config.stage1.seed, config.model.descent_samples)
-    hessians = sampling.make_sampler(sequence, device_mesh)(keys, (model, clips), progress)
+    hessians = sampling.make_sampler(sequence, device_mesh)(keys, (model, clips), progress, folder)
     good = np.isfinite(hessians).all(axis=(1, 2))
     if not good.any():
         raise ValueError(

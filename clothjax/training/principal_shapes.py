@@ -1,6 +1,7 @@
 """Initial blend shapes: the principal components of simulated cloth, without a network."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,7 @@ def simulate(
     config: Config,
     progress: Callable[[int], None] = lambda _: None,
     device_mesh: Mesh | None = None,
+    folder: Path | None = None,
 ) -> np.ndarray:
     """Simulate cloth on random clips, bodies and materials: canonical displacements [N, T, V, 3] m.
 
@@ -62,6 +64,7 @@ def simulate(
     Args:
         progress: called with the number of sequences done.
         device_mesh: each device simulates a part of them.
+        folder: where they are kept, and read, if they are there.
 
     Raises:
         ValueError: for a garment of too many vertices, or if all sequences diverged.
@@ -106,7 +109,7 @@ def simulate(
 
     arguments = (jax.tree.map(jnp.asarray, clips), jnp.asarray(inverse))
     keys = sampling.keys(settings.seed, settings.sequences)
-    displacements = sampling.make_sampler(sequence, device_mesh)(keys, arguments, progress)
+    displacements = sampling.make_sampler(sequence, device_mesh)(keys, arguments, progress, folder)
     good = np.abs(displacements).max(axis=(1, 2, 3)) < MAX_DISPLACEMENT
     if not good.any():
         raise ValueError(

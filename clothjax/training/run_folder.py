@@ -4,9 +4,12 @@ import contextlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
+
+import numpy as np
 
 
 @contextlib.contextmanager
@@ -30,6 +33,15 @@ def lock(directory: Path) -> Iterator[None]:
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def fingerprint(settings: dict, arrays: Iterable[np.ndarray] = ()) -> int:
+    """Return a number that tells files of other settings, or that were made with other arrays, apart.
+
+    Args:
+        settings: those that the files depend on, as `configuration.to_dict` gives them.
+    """
+    return zlib.crc32(b"".join([json.dumps(settings).encode(), *(np.asarray(array).tobytes() for array in arrays)]))
 
 
 @contextlib.contextmanager

@@ -4,13 +4,15 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from clothjax.training import devices
+from clothjax.files import damage
+from clothjax.training import devices, run_folder
 from clothjax.types import Array
 
 ON_CPU, ELSEWHERE = 4, 64  # sequences in one program, by device
@@ -22,8 +24,8 @@ def make_sampler(
     """Return a function that computes `sequence(one, *arguments)` for many, compiled once.
 
     Its arguments are `each`, the first arguments of the sequences with an axis [count], such as random keys; the other
-    arguments, the same for all; and a function to call with the number of sequences done. It returns the results on
-    the host, with an axis [count].
+    arguments, the same for all; a function to call with the number of sequences done; and a folder, or None, for what
+    is done, which is read where it is there. It returns the results on the host, with an axis [count].
 
     Args:
         sequence: a function that jax can transform; it returns a pytree of arrays.
@@ -38,7 +40,9 @@ def make_sampler(
     def run(part, *arguments):
         return devices.shard(jax.vmap(sequence, (0, *(None for _ in arguments))), device_mesh)(part, *arguments)
 
-    def sample(each: Any, arguments: tuple, progress: Callable[[int], None] = lambda _: None):
+    def sample(
+        each: Any, arguments: tuple, progress: Callable[[int], None] = lambda _: None, folder: Path | None = None
+    ) -> Any:
         count = len(jax.tree.leaves(each)[0])
         size = among * min(together if on_cpu else elsewhere, -(-count // among))
         arguments = devices.replicate(arguments, device_mesh)
@@ -46,7 +50,15 @@ def make_sampler(
         def part_from(start: int):
             rows = np.arange(start, start + size) % count
             part = devices.replicate(jax.tree.map(lambda x: x[rows], each), device_mesh)
-            return jax.device_get(run(part, *arguments))
+            if folder is None:
+                return jax.device_get(run(part, *arguments))
+            path = folder / f"{start:05}_{size}.npz"
+            if not path.is_file():
+                found = jax.tree.leaves(jax.device_get(run(part, *arguments)))
+                with run_folder.whole(path) as file:
+                    np.savez(file, *found)
+            structure = jax.tree.structure(jax.eval_shape(run, part, *arguments))
+            return jax.tree.unflatten(structure, _kept(path))
 
         parts = []
         # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
@@ -57,6 +69,14 @@ def make_sampler(
         return jax.tree.map(lambda *each: np.concatenate(each)[:count], *parts)
 
     return sample
+
+
+def _kept(path: Path) -> list[np.ndarray]:
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            return [file[name] for name in file.files]
+    except damage.UNREADABLE as error:
+        raise ValueError(f"{path}: not readable ({error}); remove it to compute it again") from error
 
 
 def keys(seed: int, count: int) -> Array:

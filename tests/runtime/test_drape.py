@@ -86,7 +86,8 @@ def test_it_is_the_animator_of_training(kind, motion, request):
         before = ClothState(hung.position, hung.velocity, 0 * hung.velocity, state.latent, hung.change)
         if scene.felt is not None:  # the garment that is shown has a place of its own
             window = characters.window(scene, character, poses)
-            before = time_step.start(character, window, len(state.latent))._replace(latent=state.latent, change=hung.change)
+            before = time_step.start(character, window, len(state.latent))
+            before = before._replace(latent=state.latent, change=hung.change)
         expected = advance(before, poses)
         state, _ = inference.step(model, state, pose(motion, frame + 2))
         if scene.felt is not None:
@@ -129,6 +130,25 @@ def test_what_is_shown_takes_part_in_the_relaxation_of_what_feels(coarse, motion
     np.testing.assert_allclose(found, expected - root[None], atol=3e-5)
     unrelaxed = drape.shown(model, code, transforms)
     assert 1e-3 < np.abs(np.asarray(found - unrelaxed)).max() < 0.05
+
+
+def test_the_garment_that_feels_is_a_level_of_detail_of_the_same_states(coarse, motion):
+    """A scene can change from one to the other in any frame, and they are near each other."""
+    fine, rough = coarse.model(betas=np.ones(10)), coarse.model(betas=np.ones(10), coarse=True)
+    assert rough.network.predictor.felt is None and rough.wearer.template.shape[1] < fine.wearer.template.shape[1] / 3
+    felt = coarse.experiment.scene.felt
+    one, other = (inference.initial_state(model, pose(motion, 0)) for model in (fine, rough))
+    for t in range(1, FRAMES):
+        one, shown = inference.step(fine, one, pose(motion, t))
+        other, roughly = inference.step(fine if t == 6 else rough, other, pose(motion, t))
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(a, b, atol=3e-5)
+        if t == 6:
+            np.testing.assert_allclose(roughly, shown, atol=3e-5)
+        else:
+            apart = np.linalg.norm(felt.on_garment.interpolated(shown) - roughly, axis=1)
+            free = ~np.asarray(felt.garment.pinned)
+            assert np.median(apart[free]) < 5e-3
 
 
 def test_the_same_mesh_in_the_place_of_its_own_changes_nothing(motion):

@@ -21,7 +21,7 @@ from clothjax.physics import contact_search, descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import inference, loading, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
-from clothjax.training import imitation, labels, pipeline, pool, sampling, stage1
+from clothjax.training import imitation, labels, pipeline, pool, run_folder, sampling, stage1
 from clothjax.training.labels import Round
 
 
@@ -341,12 +341,12 @@ def test_a_round_survives_a_file(finished, tmp_path):
 
 def test_labels_of_something_else_and_damaged_ones_are_refused(toy, finished, tmp_path):
     params, path = toy[2], tmp_path / "a.npz"
-    of = labels.fingerprint({"a": 1}, params)
+    of = run_folder.fingerprint({"a": 1}, jax.tree.leaves(params))
     labels.save(finished, path, of)
     other = params | {"inverse_hessian": 2.0 * params["inverse_hessian"]}
     for settings, network in (({"a": 2}, params), ({"a": 1}, other)):
         with pytest.raises(ValueError, match=r"a\.npz: of other settings or of another Phi; remove"):
-            labels.load(path, labels.fingerprint(settings, network), finished.simulations)
+            labels.load(path, run_folder.fingerprint(settings, jax.tree.leaves(network)), finished.simulations)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=r"a\.npz: not readable labels"):
         labels.load(path, of, finished.simulations)

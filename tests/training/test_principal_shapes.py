@@ -78,3 +78,20 @@ def test_sampling_gives_each_key_its_own_and_all_of_them():
     expected = 2 * np.stack([jax.random.uniform(key, (2,)) for key in jax.random.split(jax.random.key(3), 11)])
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert done[-1] == 11 and done == sorted(done)
+
+
+def test_what_is_sampled_is_kept_and_only_what_is_missing_is_computed(tmp_path):
+    sample = sampling.make_sampler(lambda key, scale: {"x": scale * jax.random.uniform(key, (2,))})
+    keys = sampling.keys(3, 11)
+    first, second = (sample(keys, (jnp.float32(scale),), folder=tmp_path)["x"] for scale in (2.0, 3.0))
+    np.testing.assert_array_equal(first, second)
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 3
+    files[1].unlink()
+    mixed = sample(keys, (jnp.float32(3.0),), folder=tmp_path)["x"]
+    expected = np.array(first)
+    expected[4:8] *= 1.5
+    np.testing.assert_allclose(mixed, expected, rtol=1e-6)
+    files[1].write_bytes(files[1].read_bytes()[:100])
+    with pytest.raises(ValueError, match=r"00004_4\.npz: not readable .*; remove it to compute it again"):
+        sample(keys, (jnp.float32(3.0),), folder=tmp_path)
