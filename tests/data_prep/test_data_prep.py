@@ -473,6 +473,7 @@ def test_skirt_template(tmp_path, body, names):
     assert skirt.weights[:, arms].max() < 0.05
 
 
+@pytest.mark.slow
 def test_long_sleeves_go_along_the_forearms(body, names):
     shirt = templates.build("longsleeve", 400, body, names)
     for side in ("Left", "Right"):

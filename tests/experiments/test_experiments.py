@@ -30,7 +30,7 @@ TOY = [
     "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
     "--labels.rounds", "2", "--labels.simulations", "2", "--labels.frames", "4", "--labels.descent-steps", "2",
-    "--labels.last-steps", "0", "--model.relaxation", "1", "--tuning.steps", "20", "--tuning.pool", "4",
+    "--labels.last-steps", "0", "--model.relaxation", "1",
 ]  # fmt: skip
 
 
@@ -146,26 +146,22 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
             loading.load("toy")
 
 
-def test_an_unfinished_run_is_not_packed_and_a_tuning_without_its_stage_2_is_refused(finished, tmp_path):
+@pytest.mark.slow
+def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
+    """One without forces: what it reads of the pose gets a wider range. An unfinished run is not packed."""
+    without = ["--stage2.no-forces", "--model.relaxation", "0", "--tuning.steps", "20", "--tuning.pool", "4"]
     run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    shutil.rmtree(run / "tuning")
+    pipeline.train(configuration.cli(Config, [quickstart.CONFIG, *TOY, *without]), run)
+    trained.pack(run, tmp_path / "packed")
+    shutil.move(run / "tuning", tmp_path / "tuning")
     assert trained.psi(run).config.tuning.steps == 20  # as stage 2 was told
     with pytest.raises(ValueError, match="tuning is at step 0 of 20"):
-        trained.pack(run, tmp_path / "packed")
-    assert not (tmp_path / "packed").exists()
-    shutil.copytree(finished / "tuning", run / "tuning")
+        trained.pack(run, tmp_path / "unfinished")
+    assert not (tmp_path / "unfinished").exists()
+    shutil.move(tmp_path / "tuning", run / "tuning")
     shutil.rmtree(run / "stage2")
     with pytest.raises(ValueError, match="tuning belongs to a stage 2 that is no longer there"):
         pipeline.train(trained.phi(run)[0], run)
-
-
-@pytest.mark.slow
-def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
-    """One without forces: what it reads of the pose gets a wider range."""
-    without = ["--stage2.no-forces", "--model.relaxation", "0"]
-    pipeline.train(configuration.cli(Config, [quickstart.CONFIG, *TOY, *without]), tmp_path / "run")
-    trained.pack(tmp_path / "run", tmp_path / "packed")
     settings = ["--motions", "dance_3", "--tuning.steps", "40", "--tuning.decay-start", "1.0"]
     settings += ["--tuning.learning-rate", "1e-2", "--tuning.ema", "0.5"]  # so that 40 steps are seen
     report = tmp_path / "packed" / "report.json"

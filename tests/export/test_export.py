@@ -490,6 +490,7 @@ def test_litert_refuses_forces(forced, tmp_path, int8):
         litert.to_litert(forced["skip"], tmp_path / "g.tflite", int8=int8)
 
 
+@pytest.mark.slow
 def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
     clip = Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     for model in (forced["relu"], forced["mesh"], forced["relaxed"]):

@@ -340,6 +340,7 @@ def test_specialised_it_is_the_same_and_with_fewer_shapes_nearly(forced, model, 
         assert 1e-6 < apart < 0.3 * np.abs(moved - expected).mean()
 
 
+@pytest.mark.slow
 def test_specialised_it_relaxes_as_before(relaxing, motion):
     model = relaxing.model(betas=np.linspace(-1, 1, 10))
     whole, _ = inference.animate(model, motion)
