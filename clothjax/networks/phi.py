@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.body import skinning
 from clothjax.config import MaterialConfig, ModelConfig
 from clothjax.networks import decoder, graph_features, message_passing, mlp, normalisation
 from clothjax.networks.graph_features import Features
@@ -22,7 +21,7 @@ from clothjax.simulation import characters
 from clothjax.simulation.characters import Character, Frame, Window
 from clothjax.simulation.rollout import StepInput, StepOutput
 from clothjax.simulation.scene import Scene
-from clothjax.types import Array, Garment
+from clothjax.types import Array, Garment, Material, Mesh, Rest
 
 DESCENT_BOUND = 0.3  # length of a descent step, in units of the code
 
@@ -159,7 +158,11 @@ def felt(
 ) -> Array:
     """Decode a code [L] to the garment that feels, [Vf, 3] m at a frame; arguments of `decode`."""
     unrelaxed = skinned(displacement(garment, scene, latent, config), scene, character, frame)
-    return relaxed(unrelaxed, scene, character, config)
+    if scene.felt is None:
+        return relaxed(unrelaxed, scene.garment, scene.mesh, character.rest, character.material, config)
+    assert character.felt is not None
+    cloth, mesh = scene.felt.garment, scene.felt.mesh
+    return relaxed(unrelaxed, cloth, mesh, character.felt.rest, character.material, config)
 
 
 def displacement(garment: Params, scene: Scene, latent: Array, config: ModelConfig) -> Array:
@@ -175,27 +178,17 @@ def skinned(displaced: Array, scene: Scene, character: Character, frame: Frame) 
     return decoder.vertices(scene.felt.on_garment.interpolated(displaced), character.felt.template, frame.felt)
 
 
-def relaxed(position: Array, scene: Scene, character: Character, config: ModelConfig) -> Array:
-    """Return the garment that feels, [Vf, 3] m, after `model.relaxation` steps."""
+def relaxed(
+    position: Array, garment: Garment, mesh: Mesh, rest: Rest, material: Material, config: ModelConfig
+) -> Array:
+    """Return a garment [V, 3] m after `model.relaxation` steps."""
     if config.relaxation == 0:
         return position
-    cloth, mesh = (scene.garment, scene.mesh) if scene.felt is None else (scene.felt.garment, scene.felt.mesh)
-    rest, material = character.rest if character.felt is None else character.felt.rest, character.material
-    mobility = relaxation.mobility(rest, material, mesh, free(cloth))
+    mobility = relaxation.mobility(rest, material, mesh, free(garment))
     return relaxation.relaxed(position, mobility, rest, material, mesh, config.relaxation)
 
 
 def shown(displaced: Array, scene: Scene, character: Character, window: Window, config: ModelConfig) -> Array:
-    """Return the vertices [V, 3] m of the following frame, skinned and relaxed, of a displacement [V, 3] m.
-
-    Where another garment feels, it is relaxed, and this one takes part in that.
-    """
-    frame = window.following
-    unrelaxed = skinned(displaced, scene, character, frame)
-    position = relaxed(unrelaxed, scene, character, config)
-    if scene.felt is None:
-        return position
-    assert frame.felt is not None
-    moved = skinning.unapply_direction(frame.felt, position - unrelaxed)
-    displaced += scene.felt.of_garment.interpolated(moved)
-    return decoder.vertices(displaced, character.template, frame.garment)
+    """Return the vertices [V, 3] m of the following frame, skinned and relaxed, of a displacement [V, 3] m."""
+    position = decoder.vertices(displaced, character.template, window.following.garment)
+    return relaxed(position, scene.garment, scene.mesh, character.rest, character.material, config)
