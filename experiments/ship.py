@@ -20,6 +20,7 @@ def main(argv: list[str]) -> None:
     parser = cli.Parser("experiments.ship", __doc__)
     cli.model_argument(parser, about="; such as experiments.tune left")
     parser.add_argument("name", help="of the garment")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that measure at once")
     arguments = parser.parse_args(argv)
     run, folder = trained.find(arguments.model), trained.MODELS / arguments.name
     if trained.packed(run):
@@ -36,7 +37,7 @@ def main(argv: list[str]) -> None:
             "seed": config.stage1.seed,
             "hours": seconds / 3600,
         }
-    reports = evaluate_packed({arguments.name: packed})
+    reports = evaluate_packed({arguments.name: packed}, jobs=arguments.jobs)
     (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT) if packed.resolve() != folder.resolve() else ():

@@ -57,6 +57,7 @@ def main(argv: list[str]) -> None:
     cli.model_argument(parser, nargs="+", about="; several, or `all` that come with it")
     parser.add_argument("--motions", nargs="+", default=None, help="asset names or paths; default: the configured ones")
     parser.add_argument("--json", type=Path, default=None, help="default: evaluation.json, in the folder of one run")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that measure at once")
     arguments = parser.parse_args(argv)
     names = trained.shipped() if arguments.model == ["all"] else arguments.model
     folders = {Path(name).resolve().name: trained.find(name) for name in names}
@@ -68,10 +69,10 @@ def main(argv: list[str]) -> None:
     if arguments.json is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
     if alone:
-        report = evaluate(first, arguments.motions)
+        report = evaluate(first, arguments.motions, jobs=arguments.jobs)
         print(table(report["evaluation"]))
     else:
-        report = evaluate_packed(folders, arguments.motions)
+        report = evaluate_packed(folders, arguments.motions, arguments.jobs)
         print(table(report["mean"]))
     path.write_text(json.dumps(report, indent=1) + "\n")
     print(f"written to {path}")

@@ -1,9 +1,11 @@
 """The measures of a run as one nested dictionary, and as Markdown."""
 
+import multiprocessing
 import time
 from collections.abc import Callable
-from itertools import count
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,12 +43,13 @@ PUSHES = {  # accelerations beside gravity, m/s^2, and the frames in which they 
 }
 
 
-def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) -> dict:
+def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, jobs: int = 1) -> dict:
     """Evaluate several models: a report under each name, and under `mean` the means of the methods that all have.
 
     Args:
         folders: of the models, by name.
         motions: asset names or paths; default: those that each model was to be validated on, as far as they are here.
+        jobs: as of `evaluate`.
 
     Raises:
         ValueError: if there is no model, or no motion for one.
@@ -61,14 +64,16 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None) 
             present = [motion for motion in wanted if storage.asset(motion).is_file()]
             absent = set(wanted) - set(present)
             print(f"{name}: on {', '.join(present)}", *(f"({motion} is not here)" for motion in absent))
-        reports[name] = evaluate(folder, present)
+        reports[name] = evaluate(folder, present, jobs=jobs)
     first, *others = (report["evaluation"] for report in reports.values())
     stages = [stage for stage in first if all(stage in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
     return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in stages}} | flat
 
 
-def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None) -> dict:
+def evaluate(
+    run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None, jobs: int = 1
+) -> dict:
     """Measure every method of a run: `lbs`, `phi` and `psi`, or `lbs` and a baseline.
 
     Results are in `evaluation.<method>` (means over motions) and `motions.<name>.<method>`.
@@ -76,44 +81,36 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
     Args:
         motions: asset names or paths; default: those of `settings`.
         settings: default: those that the run was trained with.
+        jobs: processes that measure at once, each a motion, the long rollout, the wearers or the pushes.
 
     Raises:
         ValueError: if there is no motion to measure on.
     """
-    experiment, model = load_run(run, settings, trained.network)
+    measured = Measured.load(run, settings)
     output_folder(run).mkdir(parents=True, exist_ok=True)
-    config = experiment.config
-    betas = assembly.betas(config)
-    stages = _stages(experiment, model, run)
-    character = assembly.dress(experiment, betas, configured_material(config))
+    config = measured.experiment.config
     names = list(motions or config.evaluation.motions)
     if not names:
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
-    shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-    by_motion, by_character, by_push, steps = {}, {}, {}, count(1)
-    with progress_bar("evaluating", 2 * len(names) + 1) as report:
-        for name in names:
-            clip = assembly.evaluation_motion(experiment, name)
-            tracks, converged = simulate(experiment, stages, character, clip)
-            report(next(steps))
-            by_motion[Path(name).stem] = measure(experiment, character, clip, tracks, converged, shapes)
-            tracks.save(run, name)
-            report(next(steps))
-        first = assembly.motion(experiment, names[0])
-        long = _long(experiment, stages, character, first)
-        if config.evaluation.wearers:
-            by_character = _characters(experiment, stages, first)
-        if config.stage2.forces:
-            by_push = _pushed(experiment, run, character, first)
-        report(next(steps))
+    for name in names:
+        assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
+    parts = [(measure_motion, name) for name in names] + [(measure_long, names[0])]
+    if config.evaluation.wearers:
+        parts.append((measure_wearers, names[0]))
+    if config.stage2.forces:
+        parts.append((measure_pushed, names[0]))
+    with progress_bar("evaluating", len(parts)) as report:
+        found = dict(zip(parts, _all(measured, parts, settings, jobs, report), strict=True))
+    by_motion = {Path(name).stem: found[measure_motion, name] for name in names}
+    long = found[measure_long, names[0]]
     return {
         "evaluation": {
-            stage: _mean([one[stage] for one in by_motion.values()]) | long.get(stage, {}) for stage in stages
+            stage: _mean([one[stage] for one in by_motion.values()]) | long.get(stage, {}) for stage in measured.stages
         },
         "motions": by_motion,
-        "wearers": by_character,
-        "pushed": by_push,
-        "betas": betas.tolist(),
+        "wearers": found.get((measure_wearers, names[0]), {}),
+        "pushed": found.get((measure_pushed, names[0]), {}),
+        "betas": assembly.betas(config).tolist(),
         "gap_frames": config.evaluation.gap_frames,
         "garment": config.garment,
     }
@@ -122,6 +119,70 @@ def evaluate(run: Path, motions: list[str] | None = None, settings: EvaluationCo
 # a method to measure: for a character and a clip it compiles a function that returns the garment's trajectory
 # [T - 2, V, 3] m, relative to the root
 Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
+
+
+class Measured(NamedTuple):
+    """What is measured: a run, its experiment and character, and its stages by name."""
+
+    run: Path
+    experiment: Experiment
+    character: Character
+    stages: dict[str, Stage]
+    blendshapes: np.ndarray | None  # of Phi, [K, V, 3] m; None where there is no Phi
+
+    @classmethod
+    def load(cls, run: Path, settings: EvaluationConfig | None = None) -> "Measured":
+        """Load what `evaluate` measures; arguments as there."""
+        experiment, model = load_run(run, settings, trained.network)
+        config = experiment.config
+        character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
+        shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
+        return cls(run, experiment, character, _stages(experiment, model, run), shapes)
+
+
+Part = tuple[Callable[[Measured, str], dict], str]
+
+
+def _all(
+    measured: Measured, parts: list[Part], settings: EvaluationConfig | None, jobs: int, report: Callable[[int], None]
+) -> list[dict]:
+    """Measure all parts in order, or by several processes, which load the run themselves."""
+    results: list[dict] = []
+
+    def add(result: dict) -> None:
+        results.append(result)
+        report(len(results))
+
+    if jobs == 1:
+        for measure, name in parts:
+            add(measure(measured, name))
+        return results
+    spawn = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
+    with ProcessPoolExecutor(min(jobs, len(parts)), spawn, _begin, (measured.run, settings)) as pool:
+        for future in [pool.submit(_work, part) for part in parts]:
+            add(future.result())
+    return results
+
+
+_own: list[Measured] = []  # what a process of `_all` measures
+
+
+def _begin(run: Path, settings: EvaluationConfig | None) -> None:
+    _own.append(Measured.load(run, settings))
+
+
+def _work(part: Part) -> dict:
+    measure, name = part
+    return measure(_own[0], name)
+
+
+def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
+    """Measure all methods on one motion, by name, and save their trajectories."""
+    run, experiment, character, stages, shapes = measured
+    clip = assembly.evaluation_motion(experiment, name)
+    tracks, converged = simulate(experiment, stages, character, clip)
+    tracks.save(run, name)
+    return measure(experiment, character, clip, tracks, converged, shapes)
 
 
 def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
@@ -206,9 +267,10 @@ def measure(
     return result
 
 
-def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) -> dict[str, dict]:
-    """Measure the gaps of all methods but skinning on nine characters, over the start of a clip."""
-    config = experiment.config
+def measure_wearers(measured: Measured, name: str) -> dict[str, dict]:
+    """Measure the gaps of all methods but skinning on nine characters, over the start of a motion."""
+    experiment, stages = measured.experiment, measured.stages
+    config, clip = experiment.config, assembly.motion(experiment, name)
     clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
     poses = windows(clip)
     sampled = np.linspace(SETTLING_FRAMES, len(clip.translation) - 4, CHARACTERS_GAPS).astype(int)
@@ -225,9 +287,10 @@ def _characters(experiment: Experiment, stages: dict[str, Stage], clip: Motion) 
     return result
 
 
-def _pushed(experiment: Experiment, run: Path, character: Character, clip: Motion) -> dict[str, dict]:
-    """Measure the gaps of a Psi with forces under accelerations beside gravity, over the start of a clip."""
-    config, frames = experiment.config, CHARACTERS_FRAMES
+def measure_pushed(measured: Measured, name: str) -> dict[str, dict]:
+    """Measure the gaps of a Psi with forces under accelerations beside gravity, over the start of a motion."""
+    run, experiment, character, *_ = measured
+    config, frames, clip = experiment.config, CHARACTERS_FRAMES, assembly.motion(experiment, name)
     clip = Motion(clip.rotations[:frames], clip.translation[:frames], clip.fps)
     poses = windows(clip)
     count = poses.translation.shape[0]
@@ -246,8 +309,10 @@ def _pushed(experiment: Experiment, run: Path, character: Character, clip: Motio
     return result
 
 
-def _long(experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion) -> dict[str, dict]:
-    """Measure all methods but skinning over the long rollout, with their times, and Psi against Phi."""
+def measure_long(measured: Measured, name: str) -> dict[str, dict]:
+    """Measure all methods but skinning over the long rollout on a motion, with their times, and Psi against Phi."""
+    _, experiment, character, stages, _ = measured
+    clip = assembly.motion(experiment, name)
     clip = assembly.there_and_back(clip, experiment.config.evaluation.long_frames + 2)
     tracks, result = {}, {}
     for name in stages:

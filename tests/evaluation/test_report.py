@@ -24,8 +24,8 @@ def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     monkeypatch.setattr(metrics, "gaps", lambda steps: {})
     experiment = forced.experiment
     character = assembly.dress(experiment, jnp.zeros(10), configured_material(experiment.config))
-    clip = assembly.motion(experiment, "walk_3")
-    assert set(report._pushed(experiment, tmp_path, character, clip)) == set(report.PUSHES)
+    measured = report.Measured(tmp_path, experiment, character, {}, None)
+    assert set(report.measure_pushed(measured, "walk_3")) == set(report.PUSHES)
     by_name = dict(zip(report.PUSHES, asked))
     for name, (acceleration, _) in report.PUSHES.items():
         track, frames, external = by_name[name]

@@ -92,8 +92,16 @@ def test_a_finished_run_is_not_trained_again(finished):
 
 @pytest.mark.slow
 def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch):
-    evaluate.main([str(finished), "--motions", "twist_3", "--json", str(finished / "twist.json")])
-    assert "twist_3" in json.loads((finished / "twist.json").read_text())["motions"]
+    arguments = [str(finished), "--motions", "twist_3", "dance_3", "--json"]
+    evaluate.main([*arguments, str(finished / "twist.json")])
+    one = json.loads((finished / "twist.json").read_text())
+    evaluate.main([*arguments, str(finished / "both.json"), "--jobs", "2"])
+    both = json.loads((finished / "both.json").read_text())
+    assert set(one["motions"]) == {"twist_3", "dance_3"}
+    for report in (one, both):
+        for stage in report["evaluation"].values():
+            stage.pop("ms_per_frame", None)
+    assert one == both
     assert "| hold_gap |" in capsys.readouterr().out
     render.main([str(finished), "--motions", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
     assert picture(finished / "t.webp").frames == 3
@@ -199,14 +207,14 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
     monkeypatch.setattr(trained, "network", lambda _: (Config(), {}))
     figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
 
-    def measured(folder, motions):
-        assert motions == ["walk_3"]
+    def measured(folder, motions, jobs):
+        assert motions == ["walk_3"] and jobs == 2
         gap, most, finite = figures[folder.name]
         stage = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
         return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), stage), "motions": {}}
 
     monkeypatch.setattr(measures, "evaluate", measured)
-    report = measures.evaluate_packed({name: tmp_path / name for name in figures})
+    report = measures.evaluate_packed({name: tmp_path / name for name in figures}, jobs=2)
     assert report["mean"]["psi"] == {"energy_gap": 0.2, "penetration_max_mm": 2.0, "finite": False}
     assert report["dress"]["phi"]["energy_gap"] == 0.3 and report["skirt"]["motions"] == {}
 
