@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from clothjax.types import Array
 
-COLUMNS = 32  # columns of a Hessian that are computed together
+COLUMNS = 32  # columns of a Hessian that are computed together on a GPU; all of a large garment do not fit there
 MEMORY = 32  # steps from which the curvature is known
 SUFFICIENT = 1e-4  # share of what the slope promises that a step must gain (Armijo)
 SHORTER = (0.1, 0.5)  # least and greatest share of a step that is tried after one that gained too little
@@ -177,8 +177,9 @@ def hessian(energy: Callable[[Array], Array], latent: Array) -> Array:
     def column(direction):
         return jax.jvp(jax.grad(energy), (latent,), (direction,))[1]
 
-    # some columns at a time: all those of a large garment would not fit into memory
-    return jax.lax.map(column, jnp.eye(len(latent)), batch_size=COLUMNS)
+    # a CPU takes eight times as long for several together
+    together = None if jax.default_backend() == "cpu" else COLUMNS
+    return jax.lax.map(column, jnp.eye(len(latent)), batch_size=together)
 
 
 def nearest_convex(matrix: Array) -> Array:
