@@ -22,12 +22,12 @@ from clothjax.networks.psi import BOUND
 from clothjax.physics.energies import GRAVITY, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import CAUSES, Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor
-from clothjax.types import Array, Motion
+from clothjax.types import Array, Material, Mesh, Motion, Rest
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; ...
-FORCED = 5  # ... and of one with forces
+FORCED = 6  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -109,6 +109,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         raise ValueError(f"plain C takes {MOST_WIDTH // 3} vertices of a garment with forces, not {len(cloth.mass)}")
     felt, template = drape.felt_garment(model)
     mesh, rest, scales = predictor.mesh, cloth.rest, predictor.scales
+    alone = None if predictor.felt is None else predictor.felt.mesh
     edges = np.asarray(forces.touching_edges(mesh, physics))
     # a cluster of the body's faces is where they are in the file, and vertices of one joint are side by side
     order = np.argsort(np.asarray(predictor.body).argmax(axis=0), kind="stable")
@@ -120,22 +121,17 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         between = even(halved(np.asarray(middles(template.T, edges)), np.arange(len(edges)), ASKED), ASKED)
     yield np.array(
         [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
-         predictor.felt is not None, len(edges), len(between), drape.relaxation_steps(model)],
+         predictor.felt is not None, len(edges), len(between), drape.relaxation_steps(model),
+         0 if alone is None else len(alone.faces)],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
     spring = 3.0 * forces.DEPTH * physics.collision_stiffness  # N/m
     rates = [1 / model.config.fps, weight, spring, physics.collision_offset, forces.HIGHEST, drape.DEEPEST, drape.REACH]
     yield np.array(rates, np.float32)
-    size = np.asarray(rest.face_area) * THICKNESS
     stiffness = 0.0 if "bending" in physics.without else np.asarray(cloth.material.bending)
     yield _padded(cloth.mass)
-    yield _padded(mesh.faces.T)
-    yield _padded(np.asarray(rest.inverse).reshape(-1, 4).T)
-    yield _padded(2.0 * np.asarray(cloth.material.mu) * size)
-    yield _padded(np.asarray(cloth.material.lam) * size)
-    if cloth.mobility is not None:
-        yield _padded(cloth.mobility)
+    yield from _fabric(mesh, rest, cloth.material, cloth.mobility)
     yield _padded(mesh.hinges.T)
     yield _padded(stiffness / (4.0 * np.asarray(rest.hinge_area)))
     yield _padded(rest.hinge_angle)
@@ -149,6 +145,8 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         yield _padded(felt.weights)
         yield _padded(predictor.felt.around.T)
         yield _padded(predictor.felt.shares.T)
+    if alone is not None and cloth.shown is not None:
+        yield from _fabric(alone, cloth.shown.rest, cloth.material, cloth.shown.mobility)
     read, code = network.read, len(network.first)
     assert isinstance(read, Layer)
     inputs = len(scales.middle) - len(cloth.constants)
@@ -172,6 +170,17 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     if predictor.felt is not None:
         yield from _layer(Layer(felt.shapes, template.reshape(-1)), gains=True)
     assert inputs == (2 + len(KINDS)) * code
+
+
+def _fabric(mesh: Mesh, rest: Rest, material: Material, mobility: Array | None) -> Iterator[np.ndarray]:
+    """Yield the arrays of a garment's stretching, with the mobility of its vertices if it is relaxed."""
+    size = np.asarray(rest.face_area) * THICKNESS
+    yield _padded(mesh.faces.T)
+    yield _padded(np.asarray(rest.inverse).reshape(-1, 4).T)
+    yield _padded(2.0 * np.asarray(material.mu) * size)
+    yield _padded(np.asarray(material.lam) * size)
+    if mobility is not None:
+        yield _padded(mobility)
 
 
 def _mlp(predictor: ForcePredictor) -> list[Layer]:

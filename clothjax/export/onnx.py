@@ -113,7 +113,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         advance = g("Transpose", stepped, perm=[0, 2, 1])
         rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
         turned = g("Sub", g.slice(pose, 2, 0, 9 * count), g.slice(last, 2, 0, 9 * count))
-        shown = output == "world"
+        shown = output == "world" and (predictor.felt is None or predictor.felt.mesh is None)
         code, touched = onnx_drape.next_code(g, model, rows, transforms, advance, turned, shown)
         low, high = (np.asarray(x) for x in network.code_bounds[:2])
         whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)
@@ -157,7 +157,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         placed = g("Add", placed, g.reshape(g.slice(pose, 2, 9 * count, 9 * count + 3), 3, 1))
     else:
         if hung is not None and apart and drape.relaxation_steps(model) > 0:
-            garment = onnx_drape.shown_apart(g, model, garment, hung)
+            garment = onnx_drape.shown_apart(g, model, garment, hung, transforms)
         placed = g.reshape(garment, 3, vertices)
     g("Transpose", placed, perm=[0, 2, 1], name="vertices")
     return given, following | {"vertices": (batch, vertices, 3)}, g

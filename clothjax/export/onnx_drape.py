@@ -123,6 +123,13 @@ def shown_outside(
         farthest = g("Add", g.dot(g("Sub", positions, point), normal), np.float32(drape.DEEPEST))
         return point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset))
 
+    if felt is not None and felt.mesh is not None:
+        outside = g.skinned(garment, transforms, model.network.weights)
+        point, normal = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in touched.vertices)
+        of_shown = targets(outside, (point, normal))
+        for _ in range(drape.relaxation_steps(model)):
+            outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, alone=True)
+        return _pushed_out(g, outside, *of_shown)
     of_vertices = targets(outside, touched.vertices)
     of_edges = None
     if touched.edges is not None:
@@ -140,21 +147,31 @@ def shown_outside(
     if felt is None:
         return outside
     back = _unapplied(g, rows, g("Sub", outside, hung.placed))
-    garment = shown_apart(g, model, garment, hung._replace(canonical=g("Add", hung.canonical, back)))
+    garment = shown_apart(g, model, garment, hung._replace(canonical=g("Add", hung.canonical, back)), transforms)
     near = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in of_vertices)
     return _pushed_out(g, g.skinned(garment, transforms, model.network.weights), *near)
 
 
-def shown_apart(g: Graph, model: Model, garment: str, hung: Hung) -> str:
-    """Return the garment [N, 3 V'] m that is shown where another feels, with its part of how that one has moved.
+def shown_apart(g: Graph, model: Model, garment: str, hung: Hung, transforms: str) -> str:
+    """Return the garment [N, 3 V'] m that is shown where another feels: with its part of how that one has moved.
+
+    If it is relaxed by itself, it is with how it moves.
 
     Args:
         garment: [N, 3 V'] m, as it is decoded.
         hung: of the other one.
+        transforms: [N, J', 12] of the joints.
     """
     it = onnx_forces.parts(model)
     felt = it.predictor.felt
     assert felt is not None
+    if felt.mesh is not None:
+        rows = onnx_forces.blended(g, transforms, np.asarray(model.network.weights))
+        decoded = g.reshape(garment, 3, len(felt.around))
+        skinned = onnx_forces.moved(g, rows, decoded)
+        placed = _relaxed(g, model, skinned, drape.relaxation_steps(model), alone=True)
+        back = _unapplied(g, rows, g("Sub", placed, skinned))
+        return g.reshape(g("Add", decoded, back), 3 * len(felt.around))
     moved = g("Sub", hung.canonical, g.reshape(hung.decoded, 3, len(it.cloth.mass)))
     taken = g("Gather", moved, np.asarray(felt.around, np.int64), axis=2)  # [N, 3, V', 3]
     taken = g("ReduceSum", g("Mul", taken, np.asarray(felt.shares)), np.array([3], np.int64), keepdims=0)
@@ -190,13 +207,21 @@ def _middles(g: Graph, positions: str, edges: np.ndarray) -> str:
     return g("Mul", g("Add", start, end), np.float32(0.5))
 
 
-def _relaxed(g: Graph, model: Model, position: str, steps: int) -> str:
-    """Return positions [N, 3, V] m after some of the steps of `relaxation.relaxed`."""
+def _relaxed(g: Graph, model: Model, position: str, steps: int, alone: bool = False) -> str:
+    """Return positions [N, 3, V] m after some of the steps of `relaxation.relaxed`.
+
+    Args:
+        alone: they are of the garment of `Felt.mesh`, not of the one that feels.
+    """
     it = onnx_forces.parts(model)
-    mobility = np.asarray(it.cloth.mobility)
-    faces, longest = np.asarray(it.predictor.mesh.faces), np.float32(relaxation.LONGEST**-2)
+    mesh, rest, mobility = it.predictor.mesh, it.cloth.rest, it.cloth.mobility
+    if alone:
+        assert it.predictor.felt is not None and it.predictor.felt.mesh is not None and it.cloth.shown is not None
+        mesh, (rest, mobility) = it.predictor.felt.mesh, it.cloth.shown
+    faces, mobility, longest = np.asarray(mesh.faces), np.asarray(mobility), np.float32(relaxation.LONGEST**-2)
     for _ in range(steps):
-        pull = onnx_forces.at_vertices(g, onnx_forces.stretching(g, it, position, faces), [faces], len(mobility))
+        gradients = onnx_forces.stretching(g, rest, it.cloth.material, position, faces)
+        pull = onnx_forces.at_vertices(g, gradients, [faces], len(mobility))
         move = g("Mul", pull, -mobility)
         length = g("Sqrt", g("Add", g("Mul", g.dot(move, move), longest), np.float32(1.0)))
         position = g("Add", position, g("Div", move, length))

@@ -13,6 +13,7 @@ from clothjax.networks import forces
 from clothjax.physics.energies import GRAVITY, SLIVER, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import Cloth, ForcePredictor, Model, Shown
+from clothjax.types import Material, Rest
 
 Planes = tuple[str, str]  # points and normals [N, 3, n]
 
@@ -76,7 +77,7 @@ def momentum(g: Graph, model: Model, it: Parts, held: str) -> str:
 def elasticity(g: Graph, model: Model, it: Parts, held: str) -> str:
     """Elastic forces [N, 3, V] in N: minus the gradient of the stretching and bending energies, in closed form."""
     faces, hinges = (np.asarray(x) for x in (it.predictor.mesh.faces, it.predictor.mesh.hinges))
-    gradients = stretching(g, it, held, faces)
+    gradients = stretching(g, it.cloth.rest, it.cloth.material, held, faces)
     gradients += _bending(g, model, it, held, hinges)
     return g("Neg", at_vertices(g, gradients, [faces, hinges], it.template.shape[1]))
 
@@ -106,9 +107,8 @@ def _around(elements: list[np.ndarray], vertices: int) -> np.ndarray:
     return table
 
 
-def stretching(g: Graph, it: Parts, held: str, faces: np.ndarray) -> list[str]:
+def stretching(g: Graph, rest: Rest, material: Material, held: str, faces: np.ndarray) -> list[str]:
     """Gradients [N, 3, F] of the stretching energy for the three corners."""
-    rest, material = it.cloth.rest, it.cloth.material
     a, b, c, d = np.asarray(rest.inverse).reshape(-1, 4).T
     size = np.asarray(rest.face_area) * THICKNESS
     stiff, lam = 2.0 * float(material.mu) * size, float(material.lam) * size

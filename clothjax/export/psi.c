@@ -9,7 +9,7 @@
 #include <string.h>
 
 #define PLAIN 1           /* version of a file without forces; ... */
-#define FORCED 5          /* ... and with them */
+#define FORCED 6          /* ... and with them */
 #define ALIGN 64          /* bytes, of all arrays */
 #define FARTHEST 1e6f     /* m from the origin */
 #define MOST_JOINTS 1024
@@ -46,15 +46,21 @@ typedef struct { /* a square matrix in sixteen bits: the rest of the first is in
     layer coarse, fine;
 } exact;
 
+typedef struct { /* a garment whose stretching is known; rows end at multiples of LANES */
+    int32_t vertices, triangles;
+    const int32_t *corner;           /* [3][triangles] */
+    const float *inverse, *mu, *lam; /* [4][triangles]; 2 mu and lam times area and thickness */
+    const float *mobility;           /* [vertices] m/N, in a step of relaxation */
+} fabric;
+
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
-    int32_t vertices, triangles, hinges, body, faces, clusters, edges, edge_clusters, relaxation;
+    int32_t vertices, hinges, body, faces, clusters, edges, edge_clusters, relaxation;
+    fabric felt, shown;                               /* the latter, if it is relaxed by itself, has triangles */
     float timestep, gravity;
     float stiffness, offset;                          /* N/m and m, of planes that are touched; ... */
     float highest, deepest, reach;                    /* ... m, raised, pushed, and far from an edge at most */
     const float *mass;                                /* [vertices] */
-    const int32_t *corner, *hinge;                    /* [3][triangles], [4][hinges] */
-    const float *inverse, *mu, *lam;                  /* [4][triangles]; 2 mu and lam times area and thickness */
-    const float *mobility;                            /* [vertices] m/N, in a step of relaxation */
+    const int32_t *hinge;                             /* [4][hinges] */
     const float *bend, *angle;                        /* [hinges] */
     const int32_t *face, *edge;                       /* [3][faces], by PATCH; [2][edges] */
     const int32_t *cluster, *edge_cluster;            /* [clusters][NEIGHBOURS] vertices, [edge_clusters] ... edges */
@@ -71,7 +77,8 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
 
 struct psi_model {
     void *file;
-    int32_t forced, apart; /* with forces; with a garment that feels apart from the one that is shown */
+    int32_t forced, apart; /* with forces; with a garment that feels apart from the one that is shown, ... */
+    int32_t alone;         /* ... which is relaxed by itself */
     forces f;
     int32_t joints, kept, moving, vertices, code, hidden, decoder, skip, relu, mixed, known;
     float fps, decay;
@@ -101,6 +108,7 @@ struct psi_state {
     int32_t *nearest;      /* the face that is nearest */
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it feels raised */
     float *target;         /* how far outside of it a vertex is pushed to be shown */
+    float *shown, *moved, *aim; /* [3], [3], [1] rows [vertices that are shown], if they are relaxed by themselves */
     /* rows [edges, to a multiple of LANES] */
     float *between;        /* [3], the middles of edges */
     int32_t *nearest_between;
@@ -234,13 +242,23 @@ static exact read_exact(reader *r, psi_model *m) {
     return e;
 }
 
+static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int relaxed) {
+    fabric c = {vertices, triangles, NULL, NULL, NULL, NULL, NULL};
+    c.corner = indices(r, 3 * padded(triangles), vertices);
+    c.inverse = floats(r, 4 * (size_t)padded(triangles));
+    c.mu = floats(r, padded(triangles));
+    c.lam = floats(r, padded(triangles));
+    if (relaxed) c.mobility = floats(r, padded(vertices));
+    return c;
+}
+
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
-    const int32_t *head = integers(r, 10);
+    const int32_t *head = integers(r, 11);
     const float *rates = floats(r, 7);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
-    f->triangles = within(r, head[1], 0, MOST_ELEMENTS);
+    const int32_t triangles = within(r, head[1], 0, MOST_ELEMENTS), shown = within(r, head[10], 0, MOST_ELEMENTS);
     f->hinges = within(r, head[2], 0, MOST_ELEMENTS);
     f->body = within(r, head[3], 1, MOST_ELEMENTS);
     f->faces = within(r, head[4], 1, MOST_ELEMENTS);
@@ -253,11 +271,7 @@ static void read_forces(reader *r, psi_model *m) {
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
     f->highest = rates[4], f->deepest = rates[5], f->reach = rates[6];
     f->mass = floats(r, padded(f->vertices));
-    f->corner = indices(r, 3 * padded(f->triangles), f->vertices);
-    f->inverse = floats(r, 4 * (size_t)padded(f->triangles));
-    f->mu = floats(r, padded(f->triangles));
-    f->lam = floats(r, padded(f->triangles));
-    if (f->relaxation) f->mobility = floats(r, padded(f->vertices));
+    f->felt = read_fabric(r, f->vertices, triangles, f->relaxation > 0);
     f->hinge = indices(r, 4 * padded(f->hinges), f->vertices);
     f->bend = floats(r, padded(f->hinges));
     f->angle = floats(r, padded(f->hinges));
@@ -270,6 +284,8 @@ static void read_forces(reader *r, psi_model *m) {
     f->weight = m->apart ? floats(r, (size_t)m->moving * padded(f->vertices)) : m->weight;
     if (m->apart) f->around = indices(r, 3 * padded(m->vertices), f->vertices);
     if (m->apart) f->share = floats(r, 3 * (size_t)padded(m->vertices));
+    m->alone = m->apart && shown > 0;
+    if (m->alone) f->shown = read_fabric(r, m->vertices, shown, 1);
     f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
     f->inverse_spread = floats(r, (2 + KINDS) * (size_t)m->code);
     f->read_fine = read_layer(r, m);
@@ -914,7 +930,7 @@ static void scatter(float *rows, size_t wide, const int32_t *index, size_t strid
             for (int c = 0; c < 3; c++) rows[c * wide + index[k * stride + i]] -= from[k][c][i];
 }
 
-static void push_stretching(const forces *f, const float *held, float *force) {
+static void push_stretching(const fabric *f, const float *held, float *force) {
     const size_t wide = padded(f->vertices), count = padded(f->triangles);
     for (size_t t = 0; t < count; t += LANES) {
         float x[3][3][LANES], g[3][3][LANES];
@@ -1097,7 +1113,7 @@ static void predict_from_forces(const psi_model *m, psi_state *s, int shown) {
     pose_body(m, s, advance);
     push_momentum(m, s, s->force);
     memset(elastic, 0, 3 * wide * sizeof(float));
-    push_stretching(f, s->held, elastic);
+    push_stretching(&f->felt, s->held, elastic);
     push_bending(f, s->held, elastic);
     const int32_t edge_clusters = shown ? f->edge_clusters : 0;
     if (edge_clusters) find_middles(f, s);
@@ -1128,12 +1144,12 @@ static void predict_from_forces(const psi_model *m, psi_state *s, int shown) {
     for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;
 }
 
-/* One step of relaxation of the garment in s->held: relaxation.relaxed. */
-static void ease(const forces *f, psi_state *s) {
+/* One step of relaxation of a garment [3][vertices], with as much room to `push` in: relaxation.relaxed. */
+static void ease(const fabric *f, float *x, float *push) {
     const size_t wide = padded(f->vertices);
-    float *push = s->force, *x = s->held, *y = x + wide, *z = y + wide;
+    float *y = x + wide, *z = y + wide;
     memset(push, 0, 3 * wide * sizeof(float));
-    push_stretching(f, s->held, push);
+    push_stretching(f, x, push);
     for (size_t i = 0; i < wide; i++) {
         const float a = f->mobility[i] * push[i], b = f->mobility[i] * push[wide + i],
                     c = f->mobility[i] * push[2 * wide + i],
@@ -1168,7 +1184,7 @@ static void relax(const forces *f, psi_state *s) {
     const size_t wide = padded(f->vertices);
     float *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
     memcpy(before, s->held, 3 * wide * sizeof(float));
-    for (int32_t n = 0; n < f->relaxation; n++) ease(f, s);
+    for (int32_t n = 0; n < f->relaxation; n++) ease(&f->felt, s->held, s->force);
     carry_back(f, s, before, canonical);
     for (size_t i = 0; i < 3 * wide; i++) s->garment[i] += canonical[i];
 }
@@ -1257,7 +1273,7 @@ static void lift(const psi_model *m, psi_state *s) {
     if (f->edge_clusters) find_targets(f, s->plane_between, s->between, edges, advance, s->target_between);
     for (int32_t n = 0; n < f->relaxation; n++) {
         push_held(f, s, advance);
-        ease(f, s);
+        ease(&f->felt, s->held, s->force);
     }
     push_held(f, s, advance);
     if (m->apart) carry_back(f, s, s->position, canonical); /* what is shown takes part in it */
@@ -1294,6 +1310,43 @@ static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
     }
 }
 
+/* How far vertex v in s->shown, relative to the last root, is outside of the plane of the one that feels beside it. */
+static inline float gap_shown(const psi_model *m, const psi_state *s, size_t v) {
+    const size_t wide = padded(m->f.vertices), rows = padded(m->vertices);
+    const float *plane = s->plane + m->f.around[v];
+    float gap = -plane[3 * wide];
+    for (int c = 0; c < 3; c++) gap += plane[c * wide] * s->shown[c * rows + v];
+    return gap;
+}
+
+static void push_shown(const psi_model *m, psi_state *s) {
+    const size_t wide = padded(m->f.vertices), rows = padded(m->vertices);
+    for (int32_t v = 0; v < m->vertices; v++) {
+        const float *plane = s->plane + m->f.around[v];
+        const float push = limited(s->aim[v] - gap_shown(m, s, v), m->f.deepest);
+        for (int c = 0; c < 3; c++) s->shown[c * rows + v] += push * plane[c * wide];
+    }
+}
+
+/* Pushes vertices [vertices][3] out of the body and relaxes them, in turn: drape._relaxed_outside. */
+static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
+    const float *last = s->translation + 3;
+    const size_t rows = padded(m->vertices);
+    for (int32_t v = 0; v < m->vertices; v++)
+        for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
+    for (int32_t v = 0; v < m->vertices; v++) {
+        const float farthest = gap_shown(m, s, v) + m->f.deepest;
+        s->aim[v] = farthest < m->f.offset ? farthest : m->f.offset;
+    }
+    for (int32_t n = 0; n < m->f.relaxation; n++) {
+        push_shown(m, s);
+        ease(&m->f.shown, s->shown, s->moved);
+    }
+    push_shown(m, s);
+    for (int32_t v = 0; v < m->vertices; v++)
+        for (int c = 0; c < 3; c++) vertices[3 * v + c] = s->shown[c * rows + v] + last[c];
+}
+
 /* Lets the garment hang on a body that stands. */
 static void settle(const psi_model *m, psi_state *s) {
     const size_t wide = padded(m->f.vertices);
@@ -1321,7 +1374,7 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     bones(m, s);
     int ordinary = 1;
     if (m->forced) {
-        predict_from_forces(m, s, vertices != NULL);
+        predict_from_forces(m, s, vertices && !m->alone);
     } else {
         pose_inputs(m, s, s->inputs);
         for (int32_t i = 0; i < m->pose.inputs; i++) s->inputs[i] -= m->pose_mean[i];
@@ -1332,13 +1385,16 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     float *swap = s->latent;
     s->latent = s->next, s->next = swap;
     if (m->forced) drape(m, s);
-    if (vertices && m->forced) lift(m, s);
+    if (vertices && m->forced && !m->alone) lift(m, s);
     if (vertices && m->forced && !m->apart) {
         show(m, s, vertices);
+    } else if (vertices && m->alone) {
+        skin(m, s, decode(m, s, &m->shapes), vertices);
+        lift_shown(m, s, vertices);
     } else if (vertices) {
         skin(m, s, m->forced ? decode_apart(m, s) : decode(m, s, &m->shapes), vertices);
     }
-    if (vertices && m->apart) push_out(m, s, vertices);
+    if (vertices && m->apart && !m->alone) push_out(m, s, vertices);
     s->outside = (finite && s->pushed ? 0 : PSI_NOT_FINITE) | (ordinary ? 0 : PSI_POSE) | (m->known ? 0 : PSI_WEARER) |
                  (inside ? 0 : PSI_CODE);
     return s->outside == 0;
@@ -1379,6 +1435,10 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->plane = part(room, &used, 4 * vertices);
     s->raised = part(room, &used, vertices);
     s->target = part(room, &used, vertices);
+    const size_t alone = m->alone ? padded(m->vertices) : 0;
+    s->shown = part(room, &used, 3 * alone);
+    s->moved = part(room, &used, 3 * alone);
+    s->aim = part(room, &used, alone);
     const size_t edges = m->f.edge_clusters ? padded(m->f.edges) : 0;
     s->between = part(room, &used, 3 * edges);
     s->nearest_between = (int32_t *)part(room, &used, edges);

@@ -23,6 +23,7 @@ from clothjax.runtime.models import (
     Model,
     Network,
     PosePredictor,
+    ShownCloth,
     Wearer,
 )
 from clothjax.types import Material, Mesh, Rest
@@ -94,7 +95,10 @@ def from_safetensors(path: str | Path) -> Model:
             params = {
                 name.removeprefix(within).replace(".", "/"): x for name, x in arrays.items() if name.startswith(within)
             }
-            felt = fields(Felt, f"{own}.felt") if f"{own}.felt.shapes" in arrays else None
+            felt = None
+            if f"{own}.felt.shapes" in arrays:
+                alone = fields(Mesh, f"{own}.felt.mesh") if f"{own}.felt.mesh.faces" in arrays else None
+                felt = fields(Felt, f"{own}.felt", mesh=alone)
             whitening = fields(Whitening, f"{own}.scales.whitening")
             scales = fields(ForceScales, f"{own}.scales", whitening=whitening)
             parts = {name: fields(of, f"{own}.{name}") for name, of in (("mesh", Mesh), ("clusters", Clusters))}
@@ -103,7 +107,11 @@ def from_safetensors(path: str | Path) -> Model:
             worn = "wearer.cloth"
             parts = {"rest": fields(Rest, f"{worn}.rest"), "material": fields(Material, f"{worn}.material")}
             parts["mobility"] = arrays[f"{worn}.mobility"] if config.model.relaxation > 0 else None
-            cloth = fields(Cloth, worn, **parts, template=arrays.get(f"{worn}.template"))
+            parts |= {"template": arrays.get(f"{worn}.template"), "shown": None}
+            if f"{worn}.shown.mobility" in arrays:
+                rest = fields(Rest, f"{worn}.shown.rest")
+                parts["shown"] = ShownCloth(rest, arrays[f"{worn}.shown.mobility"])
+            cloth = fields(Cloth, worn, **parts)
         else:
             parts = {"pose_bounds": bounds(f"{own}.pose_bounds"), "code": reader(f"{own}.code")}
             predictor = fields(PosePredictor, own, **parts, hidden=layers(f"{own}.hidden"))

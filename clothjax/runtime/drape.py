@@ -14,7 +14,7 @@ from clothjax.geometry.clusters import middles, nearest_and_of_edges
 from clothjax.networks import forces, psi
 from clothjax.physics import contact_search, incremental_potential, relaxation
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.runtime.models import Drape, ForcePredictor, Layer, Model, Network, Shown
+from clothjax.runtime.models import Drape, Felt, ForcePredictor, Layer, Model, Network, Shown
 from clothjax.types import Array, Contact, Pose
 
 HIGHEST = jax.lax.Precision.HIGHEST
@@ -67,6 +67,8 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
         touched: of `predict`, relative to the root's translation.
     """
     parts, offset, outside = _forces(model), model.config.physics.collision_offset, drape.position
+    if parts.felt is not None and parts.felt.mesh is not None:
+        return _relaxed_outside(model, shown(model, latent, transforms), touched.vertices, parts.felt)
     edges = forces.touching_edges(parts.mesh, model.config.physics)
 
     def targets(positions: Array, planes: Contact) -> tuple[Array, Array, Array]:
@@ -92,6 +94,25 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
     taken = jnp.sum(moved[:, parts.felt.around] * parts.felt.shares[None], axis=-1)  # what is shown takes part in it
     point, normal, apart = (row[parts.felt.nearest] for row in of_vertices)
     return contact_search.pushed_out(shown(model, latent, transforms, taken), point, normal, apart, DEEPEST)
+
+
+def _relaxed_outside(model: Model, garment: Array, planes: Contact, felt: Felt) -> Array:
+    """Return the garment [V, 3] m that does not feel, pushed out and relaxed in turn, as `shown_outside` does.
+
+    Args:
+        garment: before that.
+        planes: that the garment that feels touches, of which the nearest vertex has that of each of these.
+    """
+    cloth = model.wearer.cloth
+    assert cloth is not None and cloth.shown is not None and felt.mesh is not None
+    point, normal = planes.point_next[felt.nearest], planes.normal_next[felt.nearest]
+    gap = contact_search.distance(garment, point, normal)
+    apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
+    rest, mobility = cloth.shown
+    for _ in range(relaxation_steps(model)):
+        garment = contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
+        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, felt.mesh, 1)
+    return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
 
 
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:

@@ -28,6 +28,7 @@ from clothjax.runtime.models import (
     Model,
     Network,
     PosePredictor,
+    ShownCloth,
     Wearer,
     in_float32,
 )
@@ -72,15 +73,17 @@ def build(
     cloth = config.material
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
-    touched = mesh = clusters = None
+    touched = mesh = clusters = placed = own_mesh = None
     feels = garment if felt is None else felt
     if isinstance(normalizers, ForceScales):
         touched = reach.reachable(body, garment, config.physics.reach)
         mesh = topology.free_mesh(np.asarray(feels.faces), np.asarray(feels.pinned))
         clusters = contact_search.clusters(feels, touched, forces.touching_edges(mesh, config.physics))
-    on_each_other = None if felt is None else scene.placed(felt, garment)
+    if felt is not None:
+        placed = scene.placed(felt, garment)
+        own_mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     network, wearer = _arrays(
-        garment, felt, on_each_other, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas,
+        garment, felt, placed, own_mesh, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas,
         material, config,
     )  # fmt: skip
     model = Model(
@@ -100,7 +103,8 @@ def build(
 def _arrays(
     garment: Garment,
     felt: Garment | None,
-    on_each_other: tuple[OnMesh, OnMesh] | None,
+    placed: tuple[OnMesh, OnMesh] | None,
+    own_mesh: Mesh | None,
     body: Body,
     touched: Body | None,
     clusters: Clusters | None,
@@ -116,7 +120,8 @@ def _arrays(
 
     Args:
         felt: the garment that feels, if it is not the one that is shown, and ...
-        on_each_other: ... where it lies on that one, and that one on it.
+        placed: ... where it lies on that one, and that one on it; and ...
+        own_mesh: ... the elements of that one.
         touched: the part of the body that is felt, ...
         clusters: ... its faces and the garment's vertices and edges in clusters, and ...
         mesh: ... the elements that feel; None without forces.
@@ -135,8 +140,14 @@ def _arrays(
         if config.model.relaxation > 0:
             free = 1.0 - jnp.asarray(feels.pinned, jnp.float32)
             mobility = relaxation.mobility(rest, material, mesh, free)
-        own_template = None if felt is None else felt_template.T
-        cloth = Cloth(constants, areas * material.density, rest, material, shaped, mobility, own_template)
+        cloth = Cloth(constants, areas * material.density, rest, material, shaped, mobility, None)
+        if felt is not None:
+            cloth = cloth._replace(template=felt_template.T)
+        if own_mesh is not None and config.model.relaxation > 0:
+            shown, _ = energies.cloth_measures(garment, template if config.physics.shaped_rest else None, own_mesh)
+            free = 1.0 - jnp.asarray(garment.pinned, jnp.float32)
+            moved = relaxation.mobility(shown, material, own_mesh, free)
+            cloth = cloth._replace(shown=ShownCloth(shown, moved))
         corrections = None if touched.posedirs is None else jnp.asarray(touched.posedirs)
         weights = jnp.asarray(touched.weights).T
         predictor = psi.of_character(predictor, psi.scaled_inputs(normalizers, constants))
@@ -163,10 +174,11 @@ def _arrays(
         read = Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel)
     shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
     if felt is not None and isinstance(parts, ForcePredictor):
-        assert on_each_other is not None
-        on_garment, of_garment = on_each_other
-        of_felt = jax.vmap(on_garment.interpolated)(shapes)
-        parts = parts._replace(felt=Felt(_flat(of_felt), jnp.asarray(felt.weights).T, *of_garment))
+        assert placed is not None
+        on_garment, of_garment = placed
+        of_felt = _flat(jax.vmap(on_garment.interpolated)(shapes))
+        relaxed_on = own_mesh if config.model.relaxation > 0 else None
+        parts = parts._replace(felt=Felt(of_felt, jnp.asarray(felt.weights).T, *of_garment, relaxed_on))
     network = Network(
         predictor=parts,
         code_bounds=bounds,

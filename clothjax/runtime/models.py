@@ -69,6 +69,7 @@ class Felt(NamedTuple):
     weights: Array  # [J', V]
     around: Array  # [V', 3] int32, the corners of its face that is nearest to each vertex that is shown, and ...
     shares: Array  # [V', 3] ... how much of their relaxation this one takes; the first share is the largest
+    mesh: Mesh | None = None  # on which the garment that is shown is relaxed by itself; None: it takes that share
 
     @property
     def nearest(self) -> Array:
@@ -122,6 +123,13 @@ class Network(NamedTuple):
         return len(self.decoder[0].kernel)
 
 
+class ShownCloth(NamedTuple):
+    """The cloth of a garment that does not feel, and is relaxed on `Felt.mesh`."""
+
+    rest: Rest
+    mobility: Array  # [V'] m/N, of `relaxation.mobility`
+
+
 class Cloth(NamedTuple):
     """The cloth of a character with a Psi with forces, and the body that it can touch."""
 
@@ -132,6 +140,7 @@ class Cloth(NamedTuple):
     body: Array  # [B, 3] m in the canonical pose
     mobility: Array | None  # [V] m/N, of `relaxation.mobility`; None without relaxation
     template: Array | None  # [3, V] m, of the garment that feels, if it is not the one that is shown
+    shown: ShownCloth | None = None  # None where `Felt.mesh` is
 
 
 class Wearer(NamedTuple):

@@ -23,6 +23,7 @@ from clothjax.runtime.models import (
     Model,
     Network,
     PosePredictor,
+    ShownCloth,
     in_float32,
 )
 from clothjax.types import Array, Garment, Motion
@@ -203,6 +204,15 @@ def _feeling_apart(model: Model, around: np.ndarray, shares: np.ndarray) -> Mode
     else:
         kept = around[:, 0]  # of a part, so each is a vertex of the garment that is shown now
         felt = predictor.felt._replace(around=predictor.felt.around[kept], shares=predictor.felt.shares[kept])
+        if felt.mesh is not None and cloth.shown is not None:
+            number = np.full(len(cloth.shown.mobility), -1)
+            number[kept] = np.arange(len(kept))
+            faces = number[np.asarray(felt.mesh.faces)]
+            inside = (faces >= 0).all(axis=1)
+            felt = felt._replace(mesh=felt.mesh._replace(faces=jnp.asarray(faces[inside], jnp.int32)))
+            rest, mobility = cloth.shown
+            rest = rest._replace(inverse=rest.inverse[inside], face_area=rest.face_area[inside])
+            cloth = cloth._replace(shown=ShownCloth(rest, mobility[kept]))
     predictor = predictor._replace(felt=felt)
     return dataclasses.replace(
         model, network=model.network._replace(predictor=predictor), wearer=model.wearer._replace(cloth=cloth)
@@ -223,7 +233,10 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
             another mesh, or a part, already.
     """
     if isinstance(model.network.predictor, ForcePredictor) and model.network.predictor.felt is not None:
-        raise ValueError("this model shows another mesh, or a part, already: begin with the one that was loaded")
+        raise ValueError(
+            "this model shows another mesh, or a part, already: begin with the one that was loaded; one trained with "
+            "model.felt has load(..., coarse=True)"
+        )
     if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
         raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))

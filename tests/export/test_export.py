@@ -303,6 +303,7 @@ def forced():
         "relaxed mesh": specialise.on_mesh(
             relaxed, storage.load_garment("tshirt_4000", skip.experiment.body), np.ones(10)
         ),
+        "coarse": random_force_psi(relaxation=3, meshes=("tshirt_4000", "tshirt_1000")).model(betas=np.ones(10)),
     }
 
 
@@ -312,7 +313,7 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.parametrize("name", ["skip", "scaled", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh"])
+@pytest.mark.parametrize("name", ["skip", "scaled", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh", "coarse"])
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)
@@ -515,6 +516,9 @@ def test_safetensors_of_forces_of_older_formats_are_refused(forced, tmp_path):
 
 
 def test_safetensors_of_forces_that_relax_hold_the_mobility(forced, tmp_path):
+    for name in ("relaxed", "coarse"):
+        path = safetensors.to_safetensors(forced[name], tmp_path / f"{name}.safetensors")
+        assert_same(safetensors.from_safetensors(path), forced[name])
     path = safetensors.to_safetensors(forced["relaxed"], tmp_path / "relaxed.safetensors")
     with safetensors._library().safe_open(str(path), framework="numpy") as file:
         arrays = {name: file.get_tensor(name) for name in sorted(file.keys()) if not name.endswith(".mobility")}

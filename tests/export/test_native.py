@@ -156,6 +156,7 @@ def forced():
         "mesh": specialise.specialise(mesh, blendshapes=7),
         "relaxed": relaxed,
         "relaxed mesh": specialise.on_mesh(relaxed, fine, np.ones(10)),
+        "coarse": random_force_psi(relaxation=3, meshes=("tshirt_4000", "tshirt_1000")).model(betas=np.ones(10)),
     }
 
 
@@ -177,7 +178,7 @@ def of_eight_bits(model):
     return dataclasses.replace(model, network=network)
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed", "relaxed mesh"])
+@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed", "relaxed mesh", "coarse"])
 def test_c_with_forces_steps_as_the_model(forced, name, motion):
     """From the same states, in the median of frames: a vertex between two faces may take the other one."""
     if not psi_ffi.available():
