@@ -46,6 +46,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--int8", action="store_true", help="eight bits")
     parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
     parser.add_argument("--output", choices=["world", "canonical", "none"], default="world", help="of the vertices")
+    parser.add_argument("--coarse", action="store_true", help="the level of detail of a garment of model.felt")
     parser.add_argument("--blendshapes", type=int, default=None, help="largest number; default: all")
     parser.add_argument("--max-influences", type=int, default=None, help="joints that move a vertex; default: all")
     parser.add_argument("--betas", type=float, nargs="+", default=None, help="of the body; default: the mean body")
@@ -57,7 +58,7 @@ def main(argv: list[str]) -> None:
     count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]
     betas = cli.betas(arguments.betas, count)
     material = None if arguments.material is None else Material(*arguments.material)
-    model = loading.load(run, betas=betas, material=material)
+    model = loading.load(run, betas=betas, material=material, coarse=arguments.coarse)
     form = FORMATS[arguments.to]
     shipped = arguments.model in trained.shipped()
     out = arguments.out or (Path(".") if shipped else run) / f"{Path(model.config.garment).stem}.{form.suffix}"
