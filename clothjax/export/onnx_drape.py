@@ -124,10 +124,11 @@ def shown_outside(
         return point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset))
 
     if felt is not None and felt.mesh is not None:
-        outside = g.skinned(garment, transforms, model.network.weights)
+        steps = drape.relaxation_steps(model)
+        outside = _relaxed(g, model, g.skinned(garment, transforms, model.network.weights), steps, alone=True)
         point, normal = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in touched.vertices)
         of_shown = targets(outside, (point, normal))
-        for _ in range(drape.relaxation_steps(model)):
+        for _ in range(steps):
             outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, alone=True)
         return _pushed_out(g, outside, *of_shown)
     of_vertices = targets(outside, touched.vertices)

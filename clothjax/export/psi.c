@@ -1328,12 +1328,13 @@ static void push_shown(const psi_model *m, psi_state *s) {
     }
 }
 
-/* Pushes vertices [vertices][3] out of the body and relaxes them, in turn: drape._relaxed_outside. */
+/* Relaxes vertices [vertices][3], then pushes them out of the body and relaxes them in turn: drape._relaxed_outside. */
 static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
     const float *last = s->translation + 3;
     const size_t rows = padded(m->vertices);
     for (int32_t v = 0; v < m->vertices; v++)
         for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
+    for (int32_t n = 0; n < m->f.relaxation; n++) ease(&m->f.shown, s->shown, s->moved);
     for (int32_t v = 0; v < m->vertices; v++) {
         const float farthest = gap_shown(m, s, v) + m->f.deepest;
         s->aim[v] = farthest < m->f.offset ? farthest : m->f.offset;

@@ -97,7 +97,7 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
 
 
 def _relaxed_outside(model: Model, garment: Array, planes: Contact, felt: Felt) -> Array:
-    """Return the garment [V, 3] m that does not feel, pushed out and relaxed in turn, as `shown_outside` does.
+    """Return the garment [V, 3] m that does not feel, relaxed, then pushed out and relaxed in turn.
 
     Args:
         garment: before that.
@@ -105,13 +105,14 @@ def _relaxed_outside(model: Model, garment: Array, planes: Contact, felt: Felt) 
     """
     cloth = model.wearer.cloth
     assert cloth is not None and cloth.shown is not None and felt.mesh is not None
+    (rest, mobility), mesh, steps = cloth.shown, felt.mesh, relaxation_steps(model)
+    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, steps)
     point, normal = planes.point_next[felt.nearest], planes.normal_next[felt.nearest]
     gap = contact_search.distance(garment, point, normal)
     apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
-    rest, mobility = cloth.shown
-    for _ in range(relaxation_steps(model)):
+    for _ in range(steps):
         garment = contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
-        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, felt.mesh, 1)
+        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, 1)
     return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
 
 

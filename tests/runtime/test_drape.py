@@ -113,7 +113,8 @@ def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
     )
     window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
     code = 0.5 * jax.random.normal(jax.random.key(2), model.network.code_bounds.low.shape)
-    expected = phi.decode(coarse.garment, scene, character, code, window, config.model)
+    twice = dataclasses.replace(config.model, relaxation=6)  # as what is pushed out is relaxed too
+    expected = phi.decode(coarse.garment, scene, character, code, window, twice)
     rotations, joints = skinning.forward_kinematics(
         pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
     )
@@ -156,7 +157,7 @@ def test_a_part_of_what_is_relaxed_by_itself_differs_at_its_border_alone(coarse,
     whole, half = (inference.animate(each, motion) for each in (model, specialise.part(model, low)))
     assert np.abs(np.asarray(whole[0][-1] - whole[0][0])).max() > 0.01
     apart = np.linalg.norm(whole[0][:, low] - half[0], axis=-1)
-    assert np.quantile(apart, 0.8) < 1e-6 and 1e-4 < apart.max() < 0.02
+    assert np.quantile(apart, 0.6) < 1e-6 and 1e-4 < apart.max() < 0.02
     np.testing.assert_allclose(inference.animate(specialise.specialise(model), motion)[0], whole[0], atol=2e-5)
 
 
