@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.types import Array
+from clothjax.types import Array, Garment
 
 BLOCK = 64  # points
 PATCH = 32  # triangles
@@ -224,6 +224,19 @@ def on_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> OnMe
     shares = np.asarray(closest_on_triangle(points, vertices[faces[face]])[0])
     order = np.argsort(-shares, axis=1, kind="stable")
     return OnMesh(*(np.take_along_axis(rows, order, axis=1) for rows in (faces[face], shares)))
+
+
+def on_each_other(felt: Garment, garment: Garment) -> tuple[OnMesh, OnMesh]:
+    """Return where a garment that feels lies on the one that is shown, and that one on it, in the canonical pose.
+
+    Pinned vertices have no shares in the other's displacement.
+    """
+
+    def on(one: Garment, other: Garment) -> OnMesh:
+        found = on_mesh(*(np.asarray(x) for x in (one.vertices, other.vertices, other.faces)))
+        return found._replace(shares=np.where(np.asarray(one.pinned)[:, None], 0.0, found.shares))
+
+    return on(felt, garment), on(garment, felt)
 
 
 def nearest_face_around(positions: Array, body: Array, patches: Patches, vertices: Sequence[Array]) -> Array:

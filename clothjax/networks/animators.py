@@ -8,16 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.networks import baselines, decoder, forces, mlp, normalisation, phi
 from clothjax.networks.message_passing import Block
 from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.networks.psi import Psi, constant_inputs, next_code, window_inputs
-from clothjax.simulation.characters import Character
+from clothjax.physics import incremental_potential
+from clothjax.physics.incremental_potential import TimeStep
+from clothjax.simulation import characters
+from clothjax.simulation.characters import Character, Window
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
-from clothjax.types import Array
+from clothjax.types import Array, ClothState
 
 MakeAnimator = Callable[[dict, Scene, Character, Config], Animator]
 """A function from a network's variables (`params`, `statistics`), scene, character and settings to an animator."""
@@ -144,6 +148,59 @@ def psi_animator(
     return make
 
 
+def forces_on_code(
+    garment: Params,
+    scene: Scene,
+    character: Character,
+    state: ClothState,
+    window: Window,
+    config: Config,
+    external: Array | None = None,
+) -> Array:
+    """Return the forces of `forces.reduced`, [3, L] in J, on the code of a state.
+
+    Where `model.felt` is another garment than the one of the state, it is felt where the codes of two frames put it.
+
+    Args:
+        garment: parameters of the decoder.
+        state: of the garment at the current frame.
+        external: [3] m/s^2, an acceleration of the cloth beside gravity.
+    """
+    if scene.felt is None:
+        position, velocity = state.position, state.velocity
+        now, following = window.current.garment, window.following.garment
+        rest, mass, mesh, clusters = character.rest, character.mass, scene.mesh, scene.clusters
+    else:
+        assert character.felt is not None
+        position, before = (
+            phi.felt(garment, scene, character, code, frame, config.model)
+            for code, frame in ((state.latent, window.current), (state.latent - state.change, window.previous))
+        )
+        velocity = position - before
+        now, following = window.current.felt, window.following.felt
+        (_, rest, mass), mesh, clusters = character.felt, scene.felt.mesh, scene.felt.clusters
+    assert now is not None and following is not None
+    held = skinning.apply(following, skinning.unapply(now, position))
+    timestep = 1.0 / config.fps
+    step = TimeStep(
+        position=position,
+        velocity=incremental_potential.pushed(velocity, timestep, external),
+        mass=mass,
+        rest=rest,
+        material=character.material,
+        contact=None,
+        touching=None,
+        timestep=jnp.asarray(timestep, position.dtype),
+    )
+
+    def skinned(code: Array) -> Array:
+        displaced = phi.displacement(garment, scene, code, config.model)
+        return phi.skinned(displaced, scene, character, window.following)
+
+    surface = characters.surface(scene, window.following)
+    return forces.reduced(skinned, state.latent, held, step, surface, clusters, mesh, config.physics)
+
+
 def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
     """Return a function that makes a Psi with forces, of `params`, the animator of a garment, with a frozen decoder.
 
@@ -158,7 +215,7 @@ def force_psi_animator(garment: dict, scales: ForceScales) -> MakeAnimator:
 
         def step(inputs: StepInput) -> StepOutput:
             state = jax.lax.stop_gradient(inputs.state)
-            pulls = forces.on_code(garment, scene, character, state, inputs.window, config)
+            pulls = forces_on_code(garment, scene, character, state, inputs.window, config)
             pulls = jax.lax.stop_gradient(pulls)
             code = next_code(model["params"], scales, state.latent, state.change, pulls, constants, config.stage2)
             code += jax.lax.stop_gradient(jnp.clip(code, scales.low, scales.high) - code)

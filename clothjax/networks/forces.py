@@ -6,18 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.body import skinning
-from clothjax.config import Config, PhysicsConfig
+from clothjax.config import PhysicsConfig
 from clothjax.geometry.clusters import Clusters, nearest_in_clusters
-from clothjax.networks import phi
-from clothjax.networks.mlp import Params
 from clothjax.networks.normalisation import Whitening
 from clothjax.physics import incremental_potential
 from clothjax.physics.incremental_potential import TimeStep
-from clothjax.simulation import characters
-from clothjax.simulation.characters import Character, Window
-from clothjax.simulation.scene import Scene
-from clothjax.types import Array, ClothState, Contact, Mesh
+from clothjax.types import Array, Contact, Mesh
 
 KINDS = {"momentum": ("inertia", "gravity"), "elasticity": ("stretching", "bending"), "contact": ("collision",)}
 """Terms of the incremental potential that make up each kind of force: momentum is to where the cloth would fly freely.
@@ -127,56 +121,3 @@ def reduced(
     step = step._replace(contact=touched)
     forces = on_vertices(held, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)
-
-
-def on_code(
-    garment: Params,
-    scene: Scene,
-    character: Character,
-    state: ClothState,
-    window: Window,
-    config: Config,
-    external: Array | None = None,
-) -> Array:
-    """Return the forces of `reduced`, [3, L] in J, on the code of a state.
-
-    Where `model.felt` is another garment than the one of the state, it is felt where the codes of two frames put it.
-
-    Args:
-        garment: parameters of the decoder.
-        state: of the garment at the current frame.
-        external: [3] m/s^2, an acceleration of the cloth beside gravity.
-    """
-    if scene.felt is None:
-        position, velocity = state.position, state.velocity
-        now, following = window.current.garment, window.following.garment
-        rest, mass, mesh, clusters = character.rest, character.mass, scene.mesh, scene.clusters
-    else:
-        assert character.felt is not None
-        position, before = (
-            phi.felt(garment, scene, character, code, frame, config.model)
-            for code, frame in ((state.latent, window.current), (state.latent - state.change, window.previous))
-        )
-        velocity = position - before
-        now, following = window.current.felt, window.following.felt
-        (_, rest, mass), mesh, clusters = character.felt, scene.felt.mesh, scene.felt.clusters
-    assert now is not None and following is not None
-    held = skinning.apply(following, skinning.unapply(now, position))
-    timestep = 1.0 / config.fps
-    step = TimeStep(
-        position=position,
-        velocity=incremental_potential.pushed(velocity, timestep, external),
-        mass=mass,
-        rest=rest,
-        material=character.material,
-        contact=None,
-        touching=None,
-        timestep=jnp.asarray(timestep, position.dtype),
-    )
-
-    def skinned(code: Array) -> Array:
-        displaced = phi.displacement(garment, scene, code, config.model)
-        return phi.skinned(displaced, scene, character, window.following)
-
-    surface = characters.surface(scene, window.following)
-    return reduced(skinned, state.latent, held, step, surface, clusters, mesh, config.physics)

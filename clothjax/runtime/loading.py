@@ -14,7 +14,7 @@ from clothjax.config import Config
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import OnMesh
+from clothjax.geometry.proximity import OnMesh, on_each_other
 from clothjax.networks import forces, normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.physics import contact_search, energies, relaxation
@@ -32,7 +32,6 @@ from clothjax.runtime.models import (
     Wearer,
     in_float32,
 )
-from clothjax.simulation import scene
 from clothjax.types import Array, Body, Garment, Material, Mesh
 
 FORCE_SLACK = 0.0125  # of the range of a code of a Psi with forces, a tenth of a deviation: how far out is still inside
@@ -80,7 +79,7 @@ def build(
         mesh = topology.free_mesh(np.asarray(feels.faces), np.asarray(feels.pinned))
         clusters = contact_search.clusters(feels, touched, forces.touching_edges(mesh, config.physics))
     if felt is not None:
-        placed = scene.placed(felt, garment)
+        placed = on_each_other(felt, garment)
         own_mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     network, wearer = _arrays(
         garment, felt, placed, own_mesh, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas,
@@ -261,7 +260,7 @@ def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> t
         decoder: parameters of the decoder of `garment`.
         felt: that of `model.felt`.
     """
-    on_garment, _ = scene.placed(felt, garment)
+    on_garment, _ = on_each_other(felt, garment)
     free = 1.0 - jnp.asarray(garment.pinned, jnp.float32)
     shapes = jax.vmap(on_garment.interpolated)(decoder["blendshapes"] * free[None, :, None])
     model = dataclasses.replace(config.model, felt="")

@@ -9,7 +9,7 @@ from clothjax.body import reach
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import OnMesh, Patches, on_mesh, patches
+from clothjax.geometry.proximity import OnMesh, Patches, on_each_other, patches
 from clothjax.physics import contact_search
 from clothjax.types import Array, Body, Garment, Mesh
 
@@ -97,23 +97,10 @@ def build_scene(garment: Garment, body: Body, config: Config, felt: Garment | No
     )
 
 
-def placed(felt: Garment, garment: Garment) -> tuple[OnMesh, OnMesh]:
-    """Return where a garment that feels lies on the one that is shown, and that one on it, in the canonical pose.
-
-    Pinned vertices have no shares in the other's displacement.
-    """
-
-    def on(one: Garment, other: Garment) -> OnMesh:
-        found = on_mesh(*(np.asarray(x) for x in (one.vertices, other.vertices, other.faces)))
-        return found._replace(shares=np.where(np.asarray(one.pinned)[:, None], 0.0, found.shares))
-
-    return on(felt, garment), on(garment, felt)
-
-
 def _felt(felt: Garment, garment: Garment, within: Body | None) -> Felt:
     mesh = topology.free_mesh(np.asarray(felt.faces), np.asarray(felt.pinned))
     clusters = None if within is None else contact_search.clusters(felt, within)
-    return Felt(felt, mesh, clusters, *placed(felt, garment))
+    return Felt(felt, mesh, clusters, *on_each_other(felt, garment))
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:

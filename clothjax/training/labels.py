@@ -14,7 +14,7 @@ from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
 from clothjax.files import damage
 from clothjax.material import unscaled
-from clothjax.networks import forces, phi, psi
+from clothjax.networks import animators, phi, psi
 from clothjax.networks.normalisation import ForceScales
 from clothjax.physics import descent, incremental_potential
 from clothjax.physics.energies import GRAVITY
@@ -120,7 +120,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             def potential(new: Array) -> Array:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
-            pulls = forces.on_code(policy.garment, scene, character, state, window, config, external)
+            pulls = animators.forces_on_code(policy.garment, scene, character, state, window, config, external)
             code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
             code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code, code + SAME * lag])
