@@ -179,8 +179,8 @@ class ModelConfig:
     """Jacobi steps down the stretching energy that end the decoder. They let blend shapes fold without stretching. Only
     with `stage2.forces`."""
     felt: str = ""
-    """The same garment with fewer vertices, by asset name or path. It is relaxed, and feels the forces, in place of the
-    garment itself, and is its level of detail. Empty: the garment itself. Only with `stage2.forces`."""
+    """The same garment with fewer vertices, by asset name or path. It feels the forces in place of the garment itself,
+    and is its level of detail. Empty: the garment itself. Only with `stage2.forces`."""
     blendshape_relu: bool = False
     """A ReLU on the blend-shape weights, as in the thesis."""
     remat: bool = False

@@ -82,6 +82,13 @@ def unapply(transforms: Float[Array, "N 3 4"], points: Float[Array, "N 3"]) -> F
     return unapply_direction(transforms, points - transforms[:, :, 3])
 
 
+def carry(
+    now: Float[Array, "N 3 4"], following: Float[Array, "N 3 4"], points: Float[Array, "N 3"]
+) -> Float[Array, "N 3"]:
+    """Return points [N, 3] m posed by transforms [N, 3, 4] as those of the following frame pose them."""
+    return apply(following, unapply(now, points))
+
+
 def unapply_direction(transforms: Float[Array, "N 3 4"], vectors: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
     """Carry vectors [N, 3] back by the linear part of the transforms [N, 3, 4] (Cramer's rule).
 

@@ -17,6 +17,7 @@ PASSES = 4  # rounds over all positions, before only those without an answer are
 CHUNK = 32  # positions searched together after that
 STRIDES = 2  # steps of a search along a surface
 LAST = jnp.iinfo(jnp.int32).max
+APART = 0.03  # m, between two meshes of one garment; those of the library are up to 0.013 m apart
 TILE = 256  # triangles tried together, where all are
 
 
@@ -230,10 +231,20 @@ def on_each_other(felt: Garment, garment: Garment) -> tuple[OnMesh, OnMesh]:
     """Return where a garment that feels lies on the one that is shown, and that one on it, in the canonical pose.
 
     Pinned vertices have no shares in the other's displacement.
+
+    Raises:
+        ValueError: if a vertex of one is farther than `APART` from the other: they are not the same garment.
     """
 
     def on(one: Garment, other: Garment) -> OnMesh:
         found = on_mesh(*(np.asarray(x) for x in (one.vertices, other.vertices, other.faces)))
+        nearest = np.asarray(found.interpolated(np.asarray(other.vertices)))
+        farthest = np.linalg.norm(nearest - np.asarray(one.vertices), axis=1).max()
+        if farthest > APART:
+            raise ValueError(
+                f"model.felt and the garment lie up to {1e3 * farthest:.0f} mm apart: give the same garment with fewer "
+                f"vertices (at most {1e3 * APART:.0f} mm)"
+            )
         return found._replace(shares=np.where(np.asarray(one.pinned)[:, None], 0.0, found.shares))
 
     return on(felt, garment), on(garment, felt)

@@ -180,7 +180,7 @@ def forces_on_code(
         now, following = window.current.felt, window.following.felt
         (_, rest, mass), mesh, clusters = character.felt, scene.felt.mesh, scene.felt.clusters
     assert now is not None and following is not None
-    held = skinning.apply(following, skinning.unapply(now, position))
+    held = skinning.carry(now, following, position)
     timestep = 1.0 / config.fps
     step = TimeStep(
         position=position,

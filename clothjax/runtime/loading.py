@@ -171,7 +171,7 @@ def _arrays(
         read = Layer(jnp.concatenate([read.kernel, skip], axis=1), jnp.pad(read.bias, (0, skip.shape[1])))
     if latent is not None:
         read = Layer(latent.deviation[:, None] * read.kernel, read.bias + latent.mean @ read.kernel)
-    shapes = jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, garment_params["blendshapes"])
+    shapes = _free(garment_params["blendshapes"], garment)
     if felt is not None and isinstance(parts, ForcePredictor):
         assert placed is not None
         on_garment, of_garment = placed
@@ -189,6 +189,11 @@ def _arrays(
         weights=jnp.asarray(garment.weights).T,
     )
     return network, Wearer(bias, template.T, skinning.shaped_joints(body, betas), known, cloth)
+
+
+def _free(shapes: Array, garment: Garment) -> Array:
+    """Return blend shapes [K, V, 3] m that do not move pinned vertices."""
+    return jnp.where(jnp.asarray(garment.pinned)[None, :, None], 0.0, shapes)
 
 
 def _flat(shapes: Array) -> Array:
@@ -261,8 +266,7 @@ def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> t
         felt: that of `model.felt`.
     """
     on_garment, _ = on_each_other(felt, garment)
-    free = 1.0 - jnp.asarray(garment.pinned, jnp.float32)
-    shapes = jax.vmap(on_garment.interpolated)(decoder["blendshapes"] * free[None, :, None])
+    shapes = jax.vmap(on_garment.interpolated)(_free(decoder["blendshapes"], garment))
     model = dataclasses.replace(config.model, felt="")
     config = dataclasses.replace(config, garment=config.model.felt, model=model)
     return config, decoder | {"blendshapes": shapes}, felt

@@ -143,4 +143,4 @@ def skinned(character: Character, frame: Frame) -> Array:
 
 def carried(position: Array, window: Window) -> Array:
     """Return a garment [V, 3] m of the current frame as skinning carries it to the following one."""
-    return skinning.apply(window.following.garment, skinning.unapply(window.current.garment, position))
+    return skinning.carry(window.current.garment, window.following.garment, position)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.physics import solver
 from clothjax.physics.incremental_potential import TimeStep
@@ -40,7 +39,7 @@ def problem(scene: Scene, config: Config) -> Callable[[Character, Array, Array, 
         velocity = now - (before + poses.translation[0][None])
         cloth = ClothState(now, velocity, jnp.zeros_like(now), *[jnp.zeros(0, now.dtype)] * 2)
         step = time_step.time_step(scene, character, cloth, window, 1.0 / config.fps, config, external)
-        hold = skinning.apply(window.following.garment, skinning.unapply(window.current.garment, now))
+        hold = characters.carried(now, window)
         lbs = characters.skinned(character, window.following)
         hold = jnp.where(scene.garment.pinned[:, None], lbs, hold)
         return Problem(step, lbs, hold, poses.translation[2])

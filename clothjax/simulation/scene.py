@@ -22,13 +22,12 @@ class Table(NamedTuple):
 
 
 class Felt(NamedTuple):
-    """The garment of `model.felt`: it is relaxed, and feels the forces."""
+    """The garment of `model.felt`, which feels the forces."""
 
     garment: Garment
     mesh: Mesh  # as of `Scene`
     clusters: Clusters | None  # likewise, of this garment's vertices
     on_garment: OnMesh  # where this garment's vertices lie on the scene's; pinned ones have no shares in it
-    of_garment: OnMesh  # where the scene's garment's vertices lie on this one; likewise
 
 
 class Scene(NamedTuple):
@@ -59,7 +58,8 @@ def build_scene(garment: Garment, body: Body, config: Config, felt: Garment | No
         felt: that of `model.felt`, if it is not the garment itself.
 
     Raises:
-        ValueError: if the body is not near the garment, or a coarse level of `model.processor` would be empty.
+        ValueError: if the body is not near the garment, a coarse level of `model.processor` would be empty, or `felt`
+            is another garment.
     """
     faces = np.asarray(garment.faces)
     used = {name for stack in config.model.processor for name in stack.edges}
@@ -100,7 +100,7 @@ def build_scene(garment: Garment, body: Body, config: Config, felt: Garment | No
 def _felt(felt: Garment, garment: Garment, within: Body | None) -> Felt:
     mesh = topology.free_mesh(np.asarray(felt.faces), np.asarray(felt.pinned))
     clusters = None if within is None else contact_search.clusters(felt, within)
-    return Felt(felt, mesh, clusters, *on_each_other(felt, garment))
+    return Felt(felt, mesh, clusters, on_each_other(felt, garment)[0])
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:

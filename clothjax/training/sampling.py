@@ -25,7 +25,8 @@ def make_sampler(
 
     Its arguments are `each`, the first arguments of the sequences with an axis [count], such as random keys; the other
     arguments, the same for all; a function to call with the number of sequences done; and a folder, or None, for what
-    is done, which is read where it is there. It returns the results on the host, with an axis [count].
+    is done, which is read where it is there; then the result is one array. It returns the results on the host, with an
+    axis [count].
 
     Args:
         sequence: a function that jax can transform; it returns a pytree of arrays.
@@ -52,13 +53,13 @@ def make_sampler(
             part = devices.replicate(jax.tree.map(lambda x: x[rows], each), device_mesh)
             if folder is None:
                 return jax.device_get(run(part, *arguments))
-            path = folder / f"{start:05}_{size}.npz"
-            if not path.is_file():
-                found = jax.tree.leaves(jax.device_get(run(part, *arguments)))
-                with run_folder.whole(path) as file:
-                    np.savez(file, *found)
-            structure = jax.tree.structure(jax.eval_shape(run, part, *arguments))
-            return jax.tree.unflatten(structure, _kept(path))
+            path = folder / f"{start:05}_{size}.npy"
+            if path.is_file():
+                return _kept(path)
+            found = jax.device_get(run(part, *arguments))
+            with run_folder.whole(path) as file:
+                np.save(file, found)
+            return found
 
         parts = []
         # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
@@ -71,10 +72,9 @@ def make_sampler(
     return sample
 
 
-def _kept(path: Path) -> list[np.ndarray]:
+def _kept(path: Path) -> np.ndarray:
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return [file[name] for name in file.files]
+        return np.load(path, allow_pickle=False)
     except damage.UNREADABLE as error:
         raise ValueError(f"{path}: not readable ({error}); remove it to compute it again") from error
 

@@ -21,7 +21,7 @@ from clothjax.geometry.clusters import middles
 from clothjax.geometry.vectors import at_corners
 from clothjax.material import configured_material
 from clothjax.networks import animators, normalisation, phi
-from clothjax.physics import contact_search, energies
+from clothjax.physics import contact_search, energies, relaxation
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import drape, inference, loading, specialise, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
@@ -149,6 +149,33 @@ def test_the_garment_that_feels_is_a_level_of_detail_of_the_same_states(coarse, 
             apart = np.linalg.norm(felt.on_garment.interpolated(shown) - roughly, axis=1)
             free = ~np.asarray(felt.garment.pinned)
             assert np.median(apart[free]) < 5e-3
+
+
+def test_what_feels_is_pushed_by_an_external_acceleration(coarse, motion):
+    """In training as in use: momentum gains mass times it, pulled back to the code, and nothing else changes."""
+    experiment, push = coarse.experiment, jnp.array([3.0, 5.0, -2.0])
+    config, scene = experiment.config, experiment.scene
+    character = characters.dress(
+        scene, jnp.zeros(10), jax.tree.map(jnp.float32, configured_material(config)), config.physics
+    )
+    window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
+    code = 0.5 * jax.random.normal(jax.random.key(2), coarse.scales.low.shape)
+    state = time_step.start(character, window, len(code))._replace(latent=code)
+    given = (coarse.garment, scene, character, state, window, config)
+    calm, pushed = animators.forces_on_code(*given), animators.forces_on_code(*given, push)
+
+    def skinned(code):
+        displaced = phi.displacement(coarse.garment, scene, code, config.model)
+        return phi.skinned(displaced, scene, character, window.following)
+
+    expected = jax.vjp(skinned, code)[1](character.felt.mass[:, None] * push[None])[0]
+    np.testing.assert_allclose(pushed[0] - calm[0], expected, atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_array_equal(pushed[1:], calm[1:])
+
+
+def test_another_garment_feels_for_none():
+    with pytest.raises(ValueError, match=r"model\.felt and the garment lie up to \d+ mm apart: give the same"):
+        random_force_psi(meshes=("skirt_1000", "pants_1000"))
 
 
 def test_a_part_of_what_is_relaxed_by_itself_differs_at_its_border_alone(coarse, motion):
@@ -414,6 +441,46 @@ def test_resting_is_of_cloth_that_stays_where_it_is(model, motion):
     still = before._replace(drape=before.drape._replace(velocity=0 * before.drape.velocity))
     swings = before._replace(drape=before.drape._replace(velocity=0 * before.drape.velocity + 1e-3))
     assert inference.resting(before, still) and not inference.resting(before, swings)
+
+
+def test_a_packed_one_is_loaded_with_its_coarse_mesh_and_as_it_alone(coarse, forced, motion, tmp_path):
+    inverse = np.asarray(coarse.scales.whitening.back, np.float64) @ np.asarray(coarse.scales.whitening.back)
+    for name, it in (("coarse", coarse), ("alone", forced)):
+        phi = {"params": {"garment": it.garment, "inverse_hessian": inverse.astype(np.float32)}}
+        phi["statistics"] = {"mesh": normalisation.empty_statistics(3)}
+        trained.write(tmp_path / name, it.experiment.config, phi, it.predictor, it.scales)
+    fine, rough = (loading.load(tmp_path / "coarse", coarse=flag) for flag in (False, True))
+    assert fine.network.predictor.felt is not None and rough.network.predictor.felt is None
+    np.testing.assert_array_equal(rough.wearer.template, fine.wearer.cloth.template)
+    np.testing.assert_array_equal(rough.faces, coarse.experiment.scene.felt.garment.faces)
+    np.testing.assert_allclose(rough.network.shapes, fine.network.predictor.felt.shapes, atol=1e-7)
+    assert rough.config.garment == "skirt_1000" and not rough.config.model.felt
+    with pytest.raises(ValueError, match=r"alone: has no coarse mesh: it was trained without model\.felt"):
+        loading.load(tmp_path / "alone", coarse=True)
+
+
+def test_what_is_relaxed_by_itself_is_shown_outside_of_what_is_touched(coarse, motion):
+    model, offset = coarse.model(), coarse.experiment.config.physics.collision_offset
+    felt, pushed = model.network.predictor.felt, []
+    state = inference.initial_state(model, pose(motion, 0))
+    for t in range(1, 4):
+        rotations, joints = skinning.forward_kinematics(
+            pose(motion, t).rotations, model.wearer.joints, np.array(model.parents)
+        )
+        transforms = inference._transforms(model, rotations, joints)
+        advance = pose(motion, t).translation - pose(motion, t - 1).translation
+        _, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
+        state, vertices = inference.step(model, state, pose(motion, t))
+        cloth, garment = model.wearer.cloth, drape.shown(model, state.latent, transforms)
+        free = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 3)
+        planes = (row[felt.nearest] for row in (touched.vertices.point_next, touched.vertices.normal_next))
+        point, normal = planes
+        apart = contact_search.distance(free, point, normal)
+        target = jnp.minimum(offset, apart + drape.DEEPEST)
+        found = contact_search.distance(vertices - pose(motion, t).translation[None], point, normal)
+        assert jnp.all(found > target - 1e-5)
+        pushed.append(int(jnp.sum(apart < target - 1e-3)))
+    assert min(pushed) > 50
 
 
 def test_a_packed_one_is_the_same_but_for_rounding(forced, motion, tmp_path):

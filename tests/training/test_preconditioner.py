@@ -9,7 +9,7 @@ from toy import small
 from clothjax.body import motion_clips
 from clothjax.config import Range
 from clothjax.networks import animators
-from clothjax.physics import incremental_potential
+from clothjax.physics import descent, incremental_potential
 from clothjax.simulation import assembly, rollout
 from clothjax.training import pool, preconditioner, stage1
 
@@ -71,3 +71,16 @@ def test_loops_that_all_blow_up_are_reported():
     state = stage1.init(experiment.scene, reel, config)
     with pytest.raises(ValueError, match="no rollout of an untrained Phi stayed finite"):
         preconditioner.measure({"params": state.params, "statistics": state.statistics}, experiment.scene, reel, config)
+
+
+def test_a_hessian_is_the_same_in_columns_one_by_one_and_together(monkeypatch):
+    matrix = np.random.default_rng(0).normal(size=(40, 40)).astype(np.float32)
+    matrix = matrix + matrix.T
+
+    def energy(x):
+        return 0.5 * jnp.dot(x, jnp.matmul(matrix, x, precision="highest"), precision="highest")
+
+    alone = descent.hessian(energy, jnp.ones(40))
+    np.testing.assert_allclose(alone, matrix, atol=1e-5)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # 32 columns, then 8
+    np.testing.assert_allclose(descent.hessian(energy, jnp.ones(40)), matrix, atol=1e-5)

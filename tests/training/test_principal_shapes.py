@@ -10,7 +10,7 @@ from toy import small
 
 from clothjax.config import ShapesConfig
 from clothjax.simulation import assembly
-from clothjax.training import laplacian_shapes, principal_shapes, sampling
+from clothjax.training import laplacian_shapes, pipeline, principal_shapes, sampling
 
 
 @pytest.fixture(scope="module")
@@ -81,17 +81,52 @@ def test_sampling_gives_each_key_its_own_and_all_of_them():
 
 
 def test_what_is_sampled_is_kept_and_only_what_is_missing_is_computed(tmp_path):
-    sample = sampling.make_sampler(lambda key, scale: {"x": scale * jax.random.uniform(key, (2,))})
+    sample = sampling.make_sampler(lambda key, scale: scale * jax.random.uniform(key, (2,)))
     keys = sampling.keys(3, 11)
-    first, second = (sample(keys, (jnp.float32(scale),), folder=tmp_path)["x"] for scale in (2.0, 3.0))
+    first, second = (sample(keys, (jnp.float32(scale),), folder=tmp_path) for scale in (2.0, 3.0))
     np.testing.assert_array_equal(first, second)
     files = sorted(tmp_path.iterdir())
     assert len(files) == 3
     files[1].unlink()
-    mixed = sample(keys, (jnp.float32(3.0),), folder=tmp_path)["x"]
+    mixed = sample(keys, (jnp.float32(3.0),), folder=tmp_path)
     expected = np.array(first)
     expected[4:8] *= 1.5
     np.testing.assert_allclose(mixed, expected, rtol=1e-6)
     files[1].write_bytes(files[1].read_bytes()[:100])
-    with pytest.raises(ValueError, match=r"00004_4\.npz: not readable .*; remove it to compute it again"):
+    with pytest.raises(ValueError, match=r"00004_4\.npy: not readable .*; remove it to compute it again"):
         sample(keys, (jnp.float32(3.0),), folder=tmp_path)
+
+
+def test_a_run_that_is_ended_before_stage_1_simulates_no_cloth_again(skirt, tmp_path, monkeypatch):
+    config = dataclasses.replace(
+        skirt[0].config, model=dataclasses.replace(skirt[0].config.model, descent_samples=2), directory=str(tmp_path)
+    )
+
+    def begin(config):
+        return pipeline.train_phi(pipeline.prepare(config, tmp_path))
+
+    def ended(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline.preconditioner, "measure", ended)
+    with pytest.raises(KeyboardInterrupt):
+        begin(config)
+    (kept,) = tmp_path.glob("simulated_*")
+    assert len(list((kept / "shapes").iterdir())) == 1
+    folders, shapes = [], []
+    monkeypatch.setattr(principal_shapes.descent, "descend", ended)
+    monkeypatch.setattr(
+        pipeline.preconditioner, "measure", lambda *given: (folders.append(given[-1]), np.eye(len(state(given))))[1]
+    )
+
+    def state(given):
+        return given[0]["params"]["inverse_hessian"]
+
+    monkeypatch.setattr(
+        pipeline, "_fit", lambda run, stage, update, state, *_: shapes.append(state.params["garment"]["blendshapes"])
+    )
+    with pytest.raises(KeyboardInterrupt):  # other settings simulate anew
+        begin(dataclasses.replace(config, shapes=dataclasses.replace(config.shapes, seed=1)))
+    begin(config)
+    assert folders == [kept / "hessians"] and np.abs(shapes[0]).max() > 0
+    assert not list(tmp_path.glob("simulated_*"))
