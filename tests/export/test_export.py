@@ -24,7 +24,7 @@ from clothjax.files import storage
 from clothjax.geometry import clusters
 from clothjax.networks import forces
 from clothjax.physics import relaxation
-from clothjax.runtime import inference, specialise
+from clothjax.runtime import drape, inference, specialise
 from clothjax.types import Material, Motion, Pose
 
 STIFF = Material(0.2, 2e4, 4e4, 10.0)  # bends so hard that nothing else would count, if it did
@@ -347,6 +347,29 @@ def test_onnx_of_forces_relaxes_many_characters_seen_and_unseen(forced, motion, 
             if output == "world":
                 np.testing.assert_allclose(shown[output][i], vertices, atol=2e-5)
     np.testing.assert_array_equal(shown["canonical"], state[0].transpose(0, 2, 1))
+
+
+def test_onnx_gives_an_engine_the_garment_that_is_relaxed_by_itself(forced, motion, tmp_path):
+    """Skinned, the canonical garment is the one that is shown, relaxed."""
+    model, (before, now) = (
+        forced["coarse"],
+        (Pose(jnp.asarray(motion.rotations[t]), jnp.asarray(motion.translation[t])) for t in (3, 4)),
+    )
+    run = session(onnx.to_onnx(model, tmp_path / "c.onnx", output="canonical"))
+    names = (*onnx.STATE, *onnx_drape.DRAPE)
+    given = dict(zip(names, onnx.first_state(model, before))) | {"external": np.zeros((1, 3), np.float32)}
+    given |= {"rotations": np.asarray(now.rotations)[None], "translation": np.asarray(now.translation)[None]}
+    (found,) = run.run(["vertices"], {name: np.asarray(x, np.float32) for name, x in given.items()})
+    after, _ = inference.step(model, inference.initial_state(model, before), now)
+    turned, joints = skinning.forward_kinematics(now.rotations, model.wearer.joints, np.array(model.parents))
+    transforms = inference._transforms(model, turned, joints)
+    unrelaxed, cloth = drape.shown(model, after.latent, transforms), model.wearer.cloth
+    expected = relaxation.relaxed(
+        unrelaxed, cloth.shown.mobility, cloth.shown.rest, cloth.material, model.network.predictor.felt.mesh, 3
+    )
+    skinned = skinning.apply(skinning.blend(model.network.weights.T, transforms), jnp.asarray(found[0]))
+    np.testing.assert_allclose(skinned, expected, atol=1e-4)
+    assert np.abs(np.asarray(expected - unrelaxed)).max() > 1e-3
 
 
 def test_onnx_in_eight_bits_relaxes_in_full_precision(forced, motion, tmp_path, monkeypatch):

@@ -202,6 +202,24 @@ def test_c_with_forces_steps_as_the_model(forced, name, motion):
         assert of_code < 0.01 and max(of_rows) < 1.5e-3  # m; the rows have the rounding of shapes and decoder
 
 
+def test_c_relaxes_what_is_relaxed_by_itself_before_it_is_pushed_too(forced, motion, monkeypatch):
+    if not psi_ffi.available():
+        pytest.skip("needs a C++ compiler")
+    model = of_eight_bits(forced["coarse"])
+    state = inference.initial_state(model, at(motion, 0))
+    transforms = inference._transforms(model, *kinematics(model, at(motion, 1)))
+    advance = at(motion, 1).translation - at(motion, 0).translation
+    _, touched = drape.predict(model, state.latent, state.drape, transforms, at(motion, 1), advance, None)
+    state, found = psi_ffi.step(psi_ffi.pack(model), state, at(motion, 1))
+    given = (model, state.latent, state.drape, touched, transforms)
+    whole, original = drape.shown_outside(*given), relaxation.relaxed
+    monkeypatch.setattr(relaxation, "relaxed", lambda x, *rest: x if rest[-1] > 1 else original(x, *rest))
+    less = drape.shown_outside(*given)
+    found -= at(motion, 1).translation[None]
+    taken = jnp.sum((found - less) * (whole - less)) / jnp.sum((whole - less) ** 2)  # rounding goes another way
+    assert 0.7 < taken < 1.3
+
+
 def test_c_feels_planes_raised_as_far_as_jax(forced, motion, monkeypatch):
     """What the code changes by where planes are raised less: both have the same rounding."""
     if not psi_ffi.available():
