@@ -14,8 +14,10 @@ from scipy.spatial.distance import cdist
 
 import clothjax as cj
 from clothjax.body import skinning
+from clothjax.commands import convert
 from clothjax.config import Config
 from clothjax.evaluation import rollouts
+from clothjax.export import safetensors
 from clothjax.files import checkpoint, configuration, storage
 from clothjax.geometry.clusters import middles
 from clothjax.geometry.vectors import at_corners
@@ -455,6 +457,10 @@ def test_a_packed_one_is_loaded_with_its_coarse_mesh_and_as_it_alone(coarse, for
     np.testing.assert_array_equal(rough.faces, coarse.experiment.scene.felt.garment.faces)
     np.testing.assert_allclose(rough.network.shapes, fine.network.predictor.felt.shapes, atol=1e-7)
     assert rough.config.garment == "skirt_1000" and not rough.config.model.felt
+    convert.main([str(tmp_path / "coarse"), "--to", "safetensors", "--coarse", "--out", str(tmp_path / "c.safetensors")])
+    np.testing.assert_array_equal(
+        safetensors.from_safetensors(tmp_path / "c.safetensors").wearer.template, rough.wearer.template
+    )
     with pytest.raises(ValueError, match=r"alone: has no coarse mesh: it was trained without model\.felt"):
         loading.load(tmp_path / "alone", coarse=True)
 
