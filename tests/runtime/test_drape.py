@@ -457,10 +457,9 @@ def test_a_packed_one_is_loaded_with_its_coarse_mesh_and_as_it_alone(coarse, for
     np.testing.assert_array_equal(rough.faces, coarse.experiment.scene.felt.garment.faces)
     np.testing.assert_allclose(rough.network.shapes, fine.network.predictor.felt.shapes, atol=1e-7)
     assert rough.config.garment == "skirt_1000" and not rough.config.model.felt
-    convert.main([str(tmp_path / "coarse"), "--to", "safetensors", "--coarse", "--out", str(tmp_path / "c.safetensors")])
-    np.testing.assert_array_equal(
-        safetensors.from_safetensors(tmp_path / "c.safetensors").wearer.template, rough.wearer.template
-    )
+    out = tmp_path / "c.safetensors"
+    convert.main([str(tmp_path / "coarse"), "--to", "safetensors", "--coarse", "--out", str(out)])
+    np.testing.assert_array_equal(safetensors.from_safetensors(out).wearer.template, rough.wearer.template)
     with pytest.raises(ValueError, match=r"alone: has no coarse mesh: it was trained without model\.felt"):
         loading.load(tmp_path / "alone", coarse=True)
 
