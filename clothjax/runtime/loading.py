@@ -247,7 +247,7 @@ def load(
         ValueError: if the run has no readable checkpoint of stage 2, its assets are not found, or it is to be coarse
             and has no `model.felt`.
     """
-    config, decoder, *parts = trained.psi(trained.find(run))
+    config, decoder, predictor, normalizers = trained.psi(trained.find(run))
     body, names = storage.load_rig(config.body)
     garment = storage.load_garment(config.garment, body)
     felt = storage.load_garment(config.model.felt, body) if config.model.felt else None
@@ -255,7 +255,9 @@ def load(
         if felt is None:
             raise ValueError(f"{run}: has no coarse mesh: it was trained without model.felt")
         config, decoder, garment, felt = (*as_felt(config, decoder, garment, felt), None)
-    return build(config, garment, body, names, decoder, *parts, felt=felt, betas=betas, material=material)
+    return build(
+        config, garment, body, names, decoder, predictor, normalizers, felt=felt, betas=betas, material=material
+    )
 
 
 def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> tuple[Config, dict, Garment]:

@@ -188,7 +188,7 @@ def part(model: Model, vertices: Array) -> Model:
     )
 
 
-def _feeling_apart(model: Model, around: np.ndarray, shares: np.ndarray) -> Model:
+def _feeling_apart(model: Model, around: Array, shares: Array) -> Model:
     """Return a model that goes on to feel the forces on the garment of now when another is shown.
 
     Args:
