@@ -49,7 +49,9 @@ def picture(path):
 def finished(tmp_path_factory):
     """The whole quickstart in a minute."""
     directory = tmp_path_factory.mktemp("runs") / "toy"
-    quickstart.main([*TOY, "--directory", str(directory)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measures, "CHARACTERS_GAPS", 1)  # steps of the solver, which are the longest of all
+        quickstart.main([*TOY, "--directory", str(directory)])
     return directory
 
 

@@ -82,20 +82,24 @@ def test_it_is_the_animator_of_training(kind, motion, request):
     animator = make({"params": forced.predictor}, scene, character, config)
     windows = rollouts.windows(motion)
     advance = jax.jit(lambda state, poses: rollout.advance(animator, scene, character, state, poses, config)[0])
+
+    @jax.jit
+    def begun(code, poses):
+        """Where a garment that is shown alone is, and where codes put the one that feels."""
+        window = characters.window(scene, character, poses)
+        felt = phi.felt(forced.garment, scene, character, code, window.following, config.model)
+        return time_step.start(character, window, len(code)), felt - poses.translation[2][None]
+
     state, moved = inference.initial_state(model, pose(motion, 1)), []
     for frame in range(FRAMES - 2):
         hung, poses = state.drape, jax.tree.map(lambda x, frame=frame: x[frame], windows)
         before = ClothState(hung.position, hung.velocity, 0 * hung.velocity, state.latent, hung.change)
         if scene.felt is not None:  # the garment that is shown has a place of its own
-            window = characters.window(scene, character, poses)
-            before = time_step.start(character, window, len(state.latent))
-            before = before._replace(latent=state.latent, change=hung.change)
+            before = begun(state.latent, poses)[0]._replace(latent=state.latent, change=hung.change)
         expected = advance(before, poses)
         state, _ = inference.step(model, state, pose(motion, frame + 2))
         if scene.felt is not None:
-            place = phi.felt(forced.garment, scene, character, state.latent, window.following, config.model)
-            place -= poses.translation[2][None]
-            np.testing.assert_allclose(state.drape.position, place, atol=2e-5)
+            np.testing.assert_allclose(state.drape.position, begun(state.latent, poses)[1], atol=2e-5)
             if frame > 0:  # it rests at first, where in training it moves with the body
                 np.testing.assert_allclose(state.latent, expected.latent, atol=2e-5)
         else:
