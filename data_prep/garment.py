@@ -32,7 +32,7 @@ class Arguments:
     """Make a garment for a body, from a template or from a mesh that was modelled around it."""
 
     output: tyro.conf.Positional[Path]
-    template: Literal["tshirt", "longsleeve", "tank", "pants", "skirt", "dress"] | None = None
+    template: Literal["tshirt", "long_sleeve", "tank", "pants", "skirt", "dress"] | None = None
     """Kind of garment to build; give either this or --mesh."""
     vertices: int | None = None
     """Approximate number of vertices; default: 1000 for a template, the mesh's own for a mesh."""

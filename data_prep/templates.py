@@ -44,8 +44,8 @@ class Template:
 
 TEMPLATES = {
     "tshirt": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=0.55, neck=0.015),
-    "longsleeve": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=1.8, neck=0.015),
-    "tank": Template(("crotch", 0.02), 4, scoop=0.10),
+    "long_sleeve": Template(("crotch", -0.01), 4, hull=("chest", 0.0, 0.03), sleeve=1.8, neck=0.015),
+    "tank": Template(("crotch", 0.02), 4, closing=0.03, scoop=0.10),
     "pants": Template(("ankle", 0.06), 3, closing=0.02, blur=1.0, waist=True),
     "skirt": Template(
         ("thigh", -0.05),
@@ -228,8 +228,8 @@ def _cuts(kind: Template, marks: Landmarks) -> list[Callable[[np.ndarray], np.nd
         cuts.append(lambda x: np.minimum((x - base) @ up, radius - np.hypot(x[:, 0] - base[0], x[:, 2] - base[2])))
     if kind.scoop is not None:
         for side, sign in (("Left", 1), ("Right", -1)):
-            away = np.array([sign, 0.25, 0]) / np.hypot(1, 0.25)
-            cuts.append(_beyond_plane(joint[f"{side}Arm"] - [sign * 0.015, 0, 0], away))
+            edge = joint[f"{side}Arm"] - [sign * 0.02, 0, 0]
+            cuts.append(_beyond_plane(edge, np.array([sign, 0.0, 0.0]), within=0.25))
         middle, wide = neck + np.array([0, 0.01, 0]), 0.34 * broad
         cuts.append(
             lambda x: (

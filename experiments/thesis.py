@@ -28,21 +28,19 @@ from clothjax.config import Config
 from clothjax.evaluation import pictures
 from clothjax.evaluation.report import evaluate
 from clothjax.evaluation.rollouts import Tracks, load_run
-from clothjax.files import checkpoint, configuration, storage
+from clothjax.files import checkpoint, configuration
 from clothjax.render import ray_cast
 from clothjax.runtime import inference, loading, trained
 from clothjax.runtime.models import Bounds, Model
 from clothjax.simulation import assembly
 from clothjax.training.pipeline import train
 from clothjax.types import Pose
-from data_prep import garment as garment_module
-from data_prep.garment import Arguments
 from experiments.benchmark import pareto
 from experiments.html_page import Section, image, page, picture, sheet, table
 
 matplotlib.use("Agg")
 
-GARMENTS = ("tshirt", "longsleeve", "tank", "pants", "dress")
+GARMENTS = ("tshirt", "long_sleeve", "tank", "pants", "dress")
 VERTICES = 1000
 CONFIGS = {"ours": "configs/thesis.yaml", "ncs": "configs/ncs.yaml", "direct": "configs/direct.yaml"}
 TRAINED = [each.name for each in dataclasses.fields(Config) if each.name not in ("directory", "evaluation")]
@@ -98,7 +96,7 @@ def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
         run = folder / name / key
         if training:
             config = configuration.cli(
-                Config, [CONFIGS[key], "--garment", cloth(name, folder), "--directory", str(run)]
+                Config, [CONFIGS[key], "--garment", f"{name}_{VERTICES}", "--directory", str(run)]
             )
             if not finished(run, config):
                 print(f"training {run}", flush=True)
@@ -106,18 +104,6 @@ def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
         if finished(run):
             runs[key] = run
     return runs
-
-
-def cloth(name: str, folder: Path) -> str:
-    """Return the embedded garment of a name, or the file built from the template of that name."""
-    embedded = f"{name}_{VERTICES}"
-    if embedded in storage.asset_names("garment"):
-        return embedded
-    path = folder / "garments" / f"{name}.h5"
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        garment_module.main(Arguments(path, template=name, vertices=VERTICES))
-    return str(path)
 
 
 def finished(run: Path, config: Config | None = None) -> bool:

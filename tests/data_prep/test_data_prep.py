@@ -474,8 +474,16 @@ def test_skirt_template(tmp_path, body, names):
 
 
 @pytest.mark.slow
+def test_a_tank_top_ends_at_the_shoulder_joints(body, names):
+    tank = templates.build("tank", 400, body, names)
+    shoulder = np.abs(body.joints[names.index("LeftArm"), 0])
+    above_hips = tank.vertices[:, 1] > body.joints[names.index("LeftUpLeg"), 1] + 0.15
+    assert np.abs(tank.vertices[above_hips, 0]).max() < shoulder
+
+
+@pytest.mark.slow
 def test_long_sleeves_go_along_the_forearms(body, names):
-    shirt = templates.build("longsleeve", 400, body, names)
+    shirt = templates.build("long_sleeve", 400, body, names)
     for side in ("Left", "Right"):
         fore, hand = (np.asarray(body.joints[names.index(side + bone)]) for bone in ("ForeArm", "Hand"))
         along = (shirt.vertices - fore) @ (hand - fore) / np.sum((hand - fore) ** 2)

@@ -11,8 +11,7 @@ from samples import settings
 from toy import small
 
 from clothjax.config import Config, TuningConfig
-from clothjax.files import checkpoint, configuration, storage
-from data_prep import garment
+from clothjax.files import checkpoint, configuration
 from experiments import thesis
 
 
@@ -53,16 +52,6 @@ def test_one_command_trains_measures_and_draws(tmp_path, monkeypatch, capsys):
     for step in checkpoint.steps(out / "tshirt" / "ours" / "tuning" / "checkpoints"):
         (out / "tshirt" / "ours" / "tuning" / "checkpoints" / str(step)).rename(tmp_path / str(step))
     assert set(thesis.networks("tshirt", out, training=False)) == {"ncs", "direct"}
-
-
-def test_a_template_takes_the_place_of_a_garment_that_is_not_embedded(tmp_path, monkeypatch):
-    assert thesis.cloth("pants", tmp_path) == "pants_1000"
-    monkeypatch.setattr(thesis, "VERTICES", 300)
-    path = thesis.cloth("tank", tmp_path)
-    assert path == str(tmp_path / "garments" / "tank.h5")
-    assert 200 < len(storage.load_garment(path, storage.load_body("body")).vertices) < 400
-    monkeypatch.setattr(garment, "main", lambda _: pytest.fail("made again"))
-    assert thesis.cloth("tank", tmp_path) == path
 
 
 def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, monkeypatch):
