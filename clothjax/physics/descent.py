@@ -48,9 +48,11 @@ def _direction(at: _Iterate, precondition: Precondition, bound: float) -> Array:
     steps = (at.moves, at.turns, at.weights)
     rest, along = jax.lax.scan(backward, at.gradient, steps)
     turn = at.turns[0]
-    scale = jnp.sum(at.moves[0] * turn) / jnp.maximum(jnp.sum(turn * precondition(turn)), 1e-20)
+    # both at once: where the matrix is large, reading it is what takes time
+    of_turn, of_rest = jax.vmap(precondition)(jnp.stack([turn, rest]))
+    scale = jnp.sum(at.moves[0] * turn) / jnp.maximum(jnp.sum(turn * of_turn), 1e-20)
     scale = jnp.where(at.weights[0] > 0, jnp.clip(scale, *SCALE), 1.0)
-    new, _ = jax.lax.scan(forward, scale * precondition(rest), (steps, along), reverse=True)
+    new, _ = jax.lax.scan(forward, scale * of_rest, (steps, along), reverse=True)
     # deep collisions push thousands of times harder than the rest
     return -new / jnp.sqrt(1.0 + jnp.sum(new * new) / bound**2)
 
