@@ -14,7 +14,7 @@ from clothjax.config import Config
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import OnMesh, on_each_other
+from clothjax.geometry.proximity import OnMesh, carried, on_each_other
 from clothjax.networks import forces, normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.physics import contact_search, energies, relaxation
@@ -73,14 +73,15 @@ def build(
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
     touched = mesh = clusters = placed = own_mesh = None
+    if felt is not None:
+        placed = on_each_other(felt, garment)
+        felt = carried(felt, garment, placed[0])
+        own_mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     feels = garment if felt is None else felt
     if isinstance(normalizers, ForceScales):
         touched = reach.reachable(body, garment, config.physics.reach)
         mesh = topology.free_mesh(np.asarray(feels.faces), np.asarray(feels.pinned))
         clusters = contact_search.clusters(feels, touched, forces.touching_edges(mesh, config.physics))
-    if felt is not None:
-        placed = on_each_other(felt, garment)
-        own_mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     network, wearer = _arrays(
         garment, felt, placed, own_mesh, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas,
         material, config,
@@ -271,4 +272,4 @@ def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> t
     shapes = jax.vmap(on_garment.interpolated)(_free(decoder["blendshapes"], garment))
     model = dataclasses.replace(config.model, felt="")
     config = dataclasses.replace(config, garment=config.model.felt, model=model)
-    return config, decoder | {"blendshapes": shapes}, felt
+    return config, decoder | {"blendshapes": shapes}, carried(felt, garment, on_garment)

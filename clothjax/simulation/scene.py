@@ -9,7 +9,7 @@ from clothjax.body import reach
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import OnMesh, Patches, on_each_other, patches
+from clothjax.geometry.proximity import OnMesh, Patches, carried, on_each_other, patches
 from clothjax.physics import contact_search
 from clothjax.types import Array, Body, Garment, Mesh
 
@@ -100,7 +100,8 @@ def build_scene(garment: Garment, body: Body, config: Config, felt: Garment | No
 def _felt(felt: Garment, garment: Garment, within: Body | None) -> Felt:
     mesh = topology.free_mesh(np.asarray(felt.faces), np.asarray(felt.pinned))
     clusters = None if within is None else contact_search.clusters(felt, within)
-    return Felt(felt, mesh, clusters, on_each_other(felt, garment)[0])
+    on_garment, _ = on_each_other(felt, garment)
+    return Felt(carried(felt, garment, on_garment), mesh, clusters, on_garment)
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:

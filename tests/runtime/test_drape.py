@@ -157,6 +157,26 @@ def test_the_garment_that_feels_is_a_level_of_detail_of_the_same_states(coarse, 
             assert np.median(apart[free]) < 5e-3
 
 
+def test_the_garment_that_feels_is_skinned_as_the_one_that_is_shown(coarse, motion):
+    """Before relaxation the two are apart by no more than their templates."""
+    felt, garment = coarse.experiment.scene.felt, coarse.experiment.garment
+    free, own = ~np.asarray(felt.garment.pinned), storage.load_garment("skirt_1000", coarse.experiment.body)
+    np.testing.assert_allclose(np.sum(felt.garment.weights, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_array_equal(felt.garment.weights[~free], own.weights[~free])
+    of_templates = felt.on_garment.interpolated(np.asarray(garment.vertices)) - own.vertices
+    code = 0.5 * jax.random.normal(jax.random.key(2), coarse.model().network.code_bounds.low.shape)
+
+    def shown(model):
+        rotations, joints = skinning.forward_kinematics(
+            pose(motion, 9).rotations, model.wearer.joints, np.array(model.parents)
+        )
+        return drape.shown(model, code, inference._transforms(model, rotations, joints))
+
+    apart = felt.on_garment.interpolated(shown(coarse.model())) - shown(coarse.model(coarse=True))
+    apart, of_templates = (np.linalg.norm(x, axis=1)[free] for x in (apart, of_templates))
+    assert np.mean(apart) < 1.5 * np.mean(of_templates) + 1e-4
+
+
 def test_what_feels_is_pushed_by_an_external_acceleration(coarse, motion):
     """In training as in use: momentum gains mass times it, pulled back to the code, and nothing else changes."""
     experiment, push = coarse.experiment, jnp.array([3.0, 5.0, -2.0])
