@@ -2,18 +2,21 @@
 
     python -m experiments.ship runs/skirt skirt
 
-It writes `clothjax/assets/models/skirt/`: model.npz, config.yaml and report.json. The report has the measures of the
-packed model on the validation motions, the command that trained it and its hours. A folder from `experiments.tune` is
-already packed. If the library has a garment of that name, only its report is written again.
+It writes `clothjax/assets/models/skirt/`: model.npz, config.yaml, report.json and the card, README.md. The report has
+the measures of the packed model on the validation motions, the command that trained it and its hours. A folder from
+`experiments.tune` is already packed. If the library has a garment of that name, only report and card are written again.
 """
 
 import json
 import shutil
+import subprocess
+from pathlib import Path
 
 from clothjax import cli
 from clothjax.evaluation.report import evaluate_packed, table
 from clothjax.runtime import trained
 from clothjax.training.run_folder import add_seconds, read_seconds
+from experiments import model_card
 
 
 def main(argv: list[str]) -> None:
@@ -37,12 +40,23 @@ def main(argv: list[str]) -> None:
             "seed": config.stage1.seed,
             "hours": seconds / 3600,
         }
+    about["commit"] = commit()
     reports = evaluate_packed({arguments.name: packed}, jobs=arguments.jobs)
     (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT) if packed.resolve() != folder.resolve() else ():
         shutil.copy(packed / name, folder)
+    model_card.write(folder)
     print(f"{table(reports['mean'])}\nin {folder}")
+
+
+def commit() -> str:
+    """Return the commit of the project, with `-dirty` if files differ from it; `unknown` outside of a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 if __name__ == "__main__":

@@ -131,10 +131,10 @@ def packed(run: str | Path) -> bool:
 
 
 def provenance(packed: str | Path) -> dict[str, Any]:
-    """Return the `command`, `seed` and `hours` of a packed model's training, those that its report names."""
+    """Return what the report of a packed model says of its training: `command`, `seed`, `hours` and `commit`."""
     path = Path(packed) / REPORT
     report = json.loads(path.read_text()) if path.is_file() else {}
-    return {name: report[name] for name in ("command", "seed", "hours") if name in report}
+    return {name: report[name] for name in ("command", "seed", "hours", "commit") if name in report}
 
 
 def pack(run: str | Path, out: str | Path) -> int:

@@ -18,7 +18,7 @@ from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
 from clothjax.training import pipeline
 from clothjax.types import Motion
-from experiments import evaluate, gallery, quickstart, render, tune
+from experiments import evaluate, gallery, model_card, quickstart, render, ship, tune
 from experiments.stability import rollouts as stability_rollouts
 from experiments.stability.report import main, solver
 
@@ -154,6 +154,30 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
         (tmp_path / "toy" / "model.npz").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"model\.npz: not a whole packed model"):
             loading.load("toy")
+
+
+def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, monkeypatch):
+    measured = json.loads((finished / "report.json").read_text())
+    measured = measured["evaluation"] | {name: measured[name] for name in ("motions", "wearers", "pushed", "garment")}
+    monkeypatch.setattr(trained, "MODELS", tmp_path)
+    monkeypatch.setattr(ship, "evaluate_packed", lambda folders, jobs: dict.fromkeys((*folders, "mean"), measured))
+    monkeypatch.setattr(ship, "table", str)
+    ship.main([str(finished), "shirt"])
+    assert trained.shipped() == ("shirt",) and trained.provenance(tmp_path / "shirt")["commit"] == ship.commit()
+    text = (tmp_path / "shirt" / "README.md").read_text()
+    worst = max(measured["wearers"], key=lambda name: measured["wearers"][name]["psi"]["hold_gap"])
+    assert f"| character | {worst} | {measured['wearers'][worst]['psi']['hold_gap']:.2f} |" in text
+    assert f"{measured['psi']['step_error_mm']:.2g} |" in text and "assets/models/shirt/config.yaml" in text
+    report = json.loads((tmp_path / "shirt" / "report.json").read_text())
+    report["psi"]["step_error_mm"] = 777.0
+    (tmp_path / "shirt" / "report.json").write_text(json.dumps(report))
+    assert "7.8e+02 |" in model_card.card(tmp_path / "shirt")
+
+
+@pytest.mark.parametrize("name", trained.shipped())
+def test_cards_are_of_what_is_shipped(name):
+    """After a change: python -m experiments.model_card."""
+    assert (trained.MODELS / name / model_card.CARD).read_text() == model_card.card(trained.MODELS / name)
 
 
 @pytest.mark.slow
