@@ -14,7 +14,7 @@ from clothjax.config import Config
 from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import OnMesh, carried, on_each_other
+from clothjax.geometry.correspondence import OnMesh, on_each_other, rigged_like
 from clothjax.networks import forces, normalisation, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers
 from clothjax.physics import contact_search, energies, relaxation
@@ -75,7 +75,7 @@ def build(
     touched = mesh = clusters = placed = own_mesh = None
     if felt is not None:
         placed = on_each_other(felt, garment)
-        felt = carried(felt, garment, placed[0])
+        felt = rigged_like(felt, garment, placed[0])
         own_mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     feels = garment if felt is None else felt
     if isinstance(normalizers, ForceScales):
@@ -272,4 +272,4 @@ def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> t
     shapes = jax.vmap(on_garment.interpolated)(_free(decoder["blendshapes"], garment))
     model = dataclasses.replace(config.model, felt="")
     config = dataclasses.replace(config, garment=config.model.felt, model=model)
-    return config, decoder | {"blendshapes": shapes}, carried(felt, garment, on_garment)
+    return config, decoder | {"blendshapes": shapes}, rigged_like(felt, garment, on_garment)

@@ -11,7 +11,7 @@ import numpy as np
 
 from clothjax.body import skinning
 from clothjax.files import storage
-from clothjax.geometry import proximity
+from clothjax.geometry import correspondence
 from clothjax.runtime.drape import blend_weights
 from clothjax.runtime.inference import rollout
 from clothjax.runtime.models import (
@@ -240,7 +240,7 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
         raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))
-    around, shares = proximity.on_mesh(template, np.asarray(model.wearer.template).T, np.asarray(model.faces))
+    around, shares = correspondence.on_mesh(template, np.asarray(model.wearer.template).T, np.asarray(model.faces))
     shares = np.where(np.asarray(garment.pinned)[:, None], 0.0, shares)
     shapes = np.einsum("kcvi,vi->kcv", np.asarray(_rows(model.network))[:, :, around], shares)
     model = _feeling_apart(model, around, shares)

@@ -9,7 +9,8 @@ from clothjax.body import reach
 from clothjax.config import Config
 from clothjax.geometry import mesh_hierarchy, topology
 from clothjax.geometry.clusters import Clusters
-from clothjax.geometry.proximity import OnMesh, Patches, carried, on_each_other, patches
+from clothjax.geometry.correspondence import OnMesh, on_each_other, rigged_like
+from clothjax.geometry.proximity import Patches, patches
 from clothjax.physics import contact_search
 from clothjax.types import Array, Body, Garment, Mesh
 
@@ -101,7 +102,7 @@ def _felt(felt: Garment, garment: Garment, within: Body | None) -> Felt:
     mesh = topology.free_mesh(np.asarray(felt.faces), np.asarray(felt.pinned))
     clusters = None if within is None else contact_search.clusters(felt, within)
     on_garment, _ = on_each_other(felt, garment)
-    return Felt(carried(felt, garment, on_garment), mesh, clusters, on_garment)
+    return Felt(rigged_like(felt, garment, on_garment), mesh, clusters, on_garment)
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:
