@@ -10,9 +10,11 @@ import json
 from pathlib import Path
 
 from clothjax import cli
-from clothjax.config import Config, Range
+from clothjax.config import Config
+from clothjax.evaluation.report import CHARACTERS_FRAMES
 from clothjax.files import configuration, storage
 from clothjax.runtime import trained
+from clothjax.simulation import assembly
 
 CARD = "README.md"
 MEASURES = {
@@ -47,37 +49,31 @@ def card(folder: Path) -> str:
     """Return the card of a packed model, in Markdown."""
     config = configuration.load(Config, folder / trained.CONFIG, stored=True)
     report = json.loads((folder / trained.REPORT).read_text())
-    megabytes = (folder / trained.WEIGHTS).stat().st_size / 1e6
-    sections = [f"# {folder.name}", *_about(config, folder.name), *_figures(report), *_worst(report)]
-    sections += ["## Made by", f"```sh\n{report['command']}\n```"]
-    sections.append(
-        f"Seed {report['seed']}, {report['hours']:.1f} hours, measured at commit {report['commit']}. "
-        f"The weights are {megabytes:.1f} MB. How it came about is in `experiments/RESULTS.md` of the project."
+    return (
+        "\n\n".join(
+            [f"# {folder.name}", *_about(config, folder.name, report), *_figures(report), *_worst(config, report)]
+            + _training(folder, report)
+        )
+        + "\n"
     )
-    return "\n\n".join(sections) + "\n"
 
 
-def _about(config: Config, name: str) -> list[str]:
-    """Return the paragraphs on what the garment is, what it was trained on and what it is for."""
+def _about(config: Config, name: str, report: dict) -> list[str]:
+    """Return the paragraphs on what the garment is, what it was trained on, what it is for, and its known faults."""
     garment = storage.load_garment(config.garment, storage.load_body(config.body))
-    cloth, takes = config.material, [motion for motion in config.motions if "/" in motion]
-    felt = f" A mesh of it with fewer vertices, `{config.model.felt}`, feels the forces." if config.model.felt else ""
     reads = "the forces on the cloth" if config.stage2.forces else "the pose"
-    ranges = {
-        "density": (cloth.density_range, "kg/m^2"),
-        "mu": (cloth.mu_range, "Pa"),
-        "lambda": (cloth.lam_range, "Pa"),
-        "bending": (cloth.bending_range, "J"),
-    }
+    felt = f" A mesh of it with fewer vertices, `{config.model.felt}`, feels the forces." if config.model.felt else ""
+    motions = assembly.training_motions(config)
+    files, most = [motion for motion in motions if "/" in motion], config.stage1.betas
     seen = [
-        "- Physics alone: no simulated cloth.",
-        f"- {len(config.motions)} motions, {len(takes)} of them takes of CMU's motion capture.",
-        f"- Bodies with betas of -{config.stage1.betas:g} to {config.stage1.betas:g} standard deviations.",
-        "- Cloth: " + ", ".join(f"{name} {_range(limits)} {unit}" for name, (limits, unit) in ranges.items()) + ".",
+        "- Physics alone: the energy of the cloth is the loss, and no data is needed.",
+        f"- {len(motions)} motions, {len(files)} of them from files that do not come with the library.",
+        f"- Bodies with betas of -{most:g} to {most:g} standard deviations.",
+        f"- Cloth: {_cloth(config)}.",
     ]
     suits = [
-        "- Characters on the embedded body's skeleton, in the bodies and cloth above, at "
-        f"{config.fps:.0f} frames a second.",
+        f"- Characters on the skeleton of `{config.body}`, in the bodies and cloth above, at {config.fps:.0f} frames a "
+        "second.",
         "- Wind, and gravity from any side."
         if config.stage2.forces
         else "- Crowds: a frame takes a fraction of the time that forces take.",
@@ -89,6 +85,9 @@ def _about(config: Config, name: str) -> list[str]:
         faults.append("- Layers of it pass through each other.")
     if not config.stage2.forces:
         faults.append("- It feels no wind.")
+    held = [motion.removesuffix(".motion") for motion, each in report["motions"].items() if _hold_gap(each) > 1.0]
+    if held:
+        faults.append(f"- Cloth that keeps its last shape has less energy on {', '.join(f'`{it}`' for it in held)}.")
     return [
         f"`{config.garment}`, {len(garment.vertices)} vertices. Psi reads {reads}.{felt}",
         "## Trained on",
@@ -100,34 +99,65 @@ def _about(config: Config, name: str) -> list[str]:
     ]
 
 
+def _cloth(config: Config) -> str:
+    """Return the constants of the cloth of training: their ranges, if it was drawn."""
+    cloth = config.material
+    units = {"density": "kg/m^2", "mu": "Pa", "lam": "Pa", "bending": "J"}
+    if not cloth.sample:
+        return ", ".join(f"{name} {getattr(cloth, name):g} {unit}" for name, unit in units.items())
+    ranges = {name: getattr(cloth, f"{name}_range") for name in units}
+    return ", ".join(f"{name} {ranges[name].low:g} to {ranges[name].high:g} {unit}" for name, unit in units.items())
+
+
 def _figures(report: dict) -> list[str]:
+    """Return the section of measures, means over motions."""
     stages = [stage for stage in METHODS if stage in report]
     rows = [f"| | {' | '.join(METHODS[stage] for stage in stages)} |", "|---" * (len(stages) + 1) + "|"]
     for key, meaning in MEASURES.items():
         rows.append(f"| {meaning} | {' | '.join(_figure(report[stage].get(key)) for stage in stages)} |")
     names = ", ".join(f"`{name.removesuffix('.motion')}`" for name in report["motions"])
-    return ["## How good it is", f"Means over {names}, on a body that was not trained on.", "\n".join(rows)]
+    return [
+        "## How good it is",
+        f"Means over {names}, on a body that was not trained on, at commit {report.get('commit', 'unknown')}.",
+        "\n".join(rows),
+    ]
 
 
-def _worst(report: dict) -> list[str]:
+def _worst(config: Config, report: dict) -> list[str]:
     """Return the section on the motion, the character and the push on which Psi is worst."""
     rows = ["| | worst | hold gap there | mean |", "|---|---|---|---|"]
     groups = {"motion": "motions", "character": "wearers", "push": "pushed"}
     for kind, group in groups.items():
-        gaps = {name: each.get("psi", each)["hold_gap"] for name, each in report.get(group, {}).items()}
+        gaps = {name: _hold_gap(each) for name, each in report.get(group, {}).items()}
         if gaps:
             name = max(gaps, key=gaps.__getitem__)
-            mean = sum(gaps.values()) / len(gaps)
-            rows.append(f"| {kind} | {name.removesuffix('.motion')} | {gaps[name]:.2f} | {mean:.2f} |")
-    return ["## Where it is worst", "\n".join(rows)]
+            shown = {"none": "no push"}.get(name, name.removesuffix(".motion"))
+            rows.append(f"| {kind} | {shown} | {gaps[name]:.2f} | {sum(gaps.values()) / len(gaps):.2f} |")
+    clip = Path(config.evaluation.motions[0]).stem
+    about = (
+        f"Characters and pushes are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
+    )
+    return ["## Where it is worst", about, "\n".join(rows)]
+
+
+def _training(folder: Path, report: dict) -> list[str]:
+    """Return the section on how to train it again, of what the report knows."""
+    megabytes = (folder / trained.WEIGHTS).stat().st_size / 1e6
+    facts = [f"The weights are {megabytes:.1f} MB."]
+    if "hours" in report:
+        facts.insert(0, f"Training took {report['hours']:.1f} hours.")
+    if "made" in report:
+        facts.insert(0, report["made"])
+    command = [f"```sh\n{report['command']}\n```"] if "command" in report else []
+    return ["## To train it again", *command, " ".join(facts)]
+
+
+def _hold_gap(measured: dict) -> float:
+    return measured.get("psi", measured)["hold_gap"]
 
 
 def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.2g}"
-
-
-def _range(limits: Range) -> str:
-    return f"{limits.low:g} to {limits.high:g}"
+    return "" if value is None else f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}"
 
 
 if __name__ == "__main__":

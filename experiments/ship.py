@@ -40,7 +40,7 @@ def main(argv: list[str]) -> None:
             "seed": config.stage1.seed,
             "hours": seconds / 3600,
         }
-    about["commit"] = commit()
+    about["commit"] = commit(Path(__file__).parents[1])
     reports = evaluate_packed({arguments.name: packed}, jobs=arguments.jobs)
     (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,11 +50,16 @@ def main(argv: list[str]) -> None:
     print(f"{table(reports['mean'])}\nin {folder}")
 
 
-def commit() -> str:
-    """Return the commit of the project, with `-dirty` if files differ from it; `unknown` outside of a checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    try:
+def commit(project: Path) -> str:
+    """Return the commit of a checkout, with `-dirty` if files beside the shipped models differ; else `unknown`."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(project), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!clothjax/assets/models")
+        return git("rev-parse", "--short", "HEAD") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from toy import small
 
 from clothjax.config import Config, PeerConfig
+from clothjax.files import storage
 from clothjax.geometry import topology
 from clothjax.networks import decoder, forces, mlp, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers, Scale
@@ -347,7 +348,7 @@ class ForcePsi(NamedTuple):
     def model(self, coarse=False, **character):
         """Return the model of a character, which may show the garment that feels."""
         it = self.experiment
-        felt = None if it.scene.felt is None else it.scene.felt.garment
+        felt = storage.load_garment(it.config.model.felt, it.body) if it.config.model.felt else None
         config, decoder, garment = it.config, self.garment, it.garment
         if coarse:
             config, decoder, garment, felt = (*loading.as_felt(config, decoder, garment, felt), None)

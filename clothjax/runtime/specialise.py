@@ -222,7 +222,8 @@ def _feeling_apart(model: Model, around: Array, shares: Array) -> Model:
 def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     """Return the model on another mesh of the same garment, finer or coarser: a level of detail.
 
-    Each vertex takes the displacement of the nearest point of the model's own mesh.
+    Each vertex takes the displacement and the skinning of the nearest point of the model's own mesh. A pinned one has
+    no displacement, and its own skinning.
 
     Args:
         model: as it was loaded; the result can be specialised.
@@ -241,12 +242,15 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
         raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))
     around, shares = correspondence.on_mesh(template, np.asarray(model.wearer.template).T, np.asarray(model.faces))
-    shares = np.where(np.asarray(garment.pinned)[:, None], 0.0, shares)
+    pinned = np.asarray(garment.pinned)
+    weights = np.einsum("jvi,vi->jv", np.asarray(model.network.weights)[:, around], shares)
+    weights = np.where(pinned, np.asarray(garment.weights).T, weights)
+    shares = np.where(pinned[:, None], 0.0, shares)
     shapes = np.einsum("kcvi,vi->kcv", np.asarray(_rows(model.network))[:, :, around], shares)
     model = _feeling_apart(model, around, shares)
     network = model.network._replace(
         shapes=jnp.asarray(shapes.reshape(len(shapes), -1)),
-        weights=jnp.asarray(garment.weights).T[np.array(model.moving)],
+        weights=jnp.asarray(weights),
     )
     return dataclasses.replace(
         model,

@@ -131,10 +131,13 @@ def packed(run: str | Path) -> bool:
 
 
 def provenance(packed: str | Path) -> dict[str, Any]:
-    """Return what the report of a packed model says of its training: `command`, `seed`, `hours` and `commit`."""
+    """Return what the report of a packed model says of its training: `command`, `seed`, `hours`, and how it was `made`.
+
+    The last is there if the command was not run as it is.
+    """
     path = Path(packed) / REPORT
     report = json.loads(path.read_text()) if path.is_file() else {}
-    return {name: report[name] for name in ("command", "seed", "hours", "commit") if name in report}
+    return {name: report[name] for name in ("command", "seed", "hours", "made") if name in report}
 
 
 def pack(run: str | Path, out: str | Path) -> int:

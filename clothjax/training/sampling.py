@@ -31,7 +31,7 @@ def make_sampler(
     Args:
         sequence: a function that jax can transform; it returns a pytree of arrays.
         device_mesh: each device runs a part of them.
-        together: sequences in one program on a CPU; 1 for those that take different numbers of steps.
+        together: sequences in one program on a CPU, which all take as many steps as the longest of them.
         elsewhere: sequences in one program on another device.
     """
     on_cpu = jax.default_backend() == "cpu"

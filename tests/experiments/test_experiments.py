@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import shutil
+import subprocess
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,7 @@ from clothjax.body import motion_clips, reach
 from clothjax.config import Config
 from clothjax.evaluation import metrics, pictures, rollouts
 from clothjax.evaluation import report as measures
-from clothjax.files import checkpoint, configuration
+from clothjax.files import checkpoint, configuration, storage
 from clothjax.networks import normalisation
 from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
@@ -163,15 +164,36 @@ def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, mon
     monkeypatch.setattr(ship, "evaluate_packed", lambda folders, jobs: dict.fromkeys((*folders, "mean"), measured))
     monkeypatch.setattr(ship, "table", str)
     ship.main([str(finished), "shirt"])
-    assert trained.shipped() == ("shirt",) and trained.provenance(tmp_path / "shirt")["commit"] == ship.commit()
+    assert trained.shipped() == ("shirt",) and "commit" not in trained.provenance(tmp_path / "shirt")
     text = (tmp_path / "shirt" / "README.md").read_text()
     worst = max(measured["wearers"], key=lambda name: measured["wearers"][name]["psi"]["hold_gap"])
     assert f"| character | {worst} | {measured['wearers'][worst]['psi']['hold_gap']:.2f} |" in text
     assert f"{measured['psi']['step_error_mm']:.2g} |" in text and "assets/models/shirt/config.yaml" in text
     report = json.loads((tmp_path / "shirt" / "report.json").read_text())
+    assert report["commit"] == ship.commit(storage.ASSETS.parents[1])
+    assert f"{len(assembly.training_motions(trained.phi(finished)[0]))} motions, 0 of them from files" in text
     report["psi"]["step_error_mm"] = 777.0
+    report["motions"]["walk_3"]["psi"]["hold_gap"] = 1.2
+    del report["hours"], report["seed"], report["command"], report["commit"]
     (tmp_path / "shirt" / "report.json").write_text(json.dumps(report))
-    assert "7.8e+02 |" in model_card.card(tmp_path / "shirt")
+    changed = model_card.card(tmp_path / "shirt")
+    assert " | 777 |" in changed and "less energy on `walk_3`" in changed and "less energy" not in text
+
+
+def test_a_commit_is_told_from_one_with_changes(tmp_path):
+    assert ship.commit(tmp_path / "nowhere") == "unknown"
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    models = tmp_path / "clothjax" / "assets" / "models"
+    models.mkdir(parents=True)
+    for path in (tmp_path / "code.py", models / "report.json"):
+        path.write_text("before")
+    for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "first"]):
+        subprocess.run([*git, *command], check=True)
+    short = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    (models / "report.json").write_text("after")
+    assert ship.commit(tmp_path) == short
+    (tmp_path / "code.py").write_text("after")
+    assert ship.commit(tmp_path) == f"{short}-dirty"
 
 
 @pytest.mark.parametrize("name", trained.shipped())

@@ -11,7 +11,7 @@ from samples import settings
 from toy import small
 
 from clothjax.config import Config, TuningConfig
-from clothjax.files import checkpoint, configuration
+from clothjax.files import checkpoint, configuration, storage
 from experiments import thesis
 
 
@@ -52,6 +52,10 @@ def test_one_command_trains_measures_and_draws(tmp_path, monkeypatch, capsys):
     for step in checkpoint.steps(out / "tshirt" / "ours" / "tuning" / "checkpoints"):
         (out / "tshirt" / "ours" / "tuning" / "checkpoints" / str(step)).rename(tmp_path / str(step))
     assert set(thesis.networks("tshirt", out, training=False)) == {"ncs", "direct"}
+
+
+def test_the_garments_of_the_thesis_come_with_the_library():
+    assert {f"{name}_{thesis.VERTICES}" for name in thesis.GARMENTS} <= set(storage.asset_names("garment"))
 
 
 def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, monkeypatch):

@@ -154,15 +154,13 @@ def test_the_garment_that_feels_is_a_level_of_detail_of_the_same_states(coarse, 
         else:
             apart = np.linalg.norm(felt.on_garment.interpolated(shown) - roughly, axis=1)
             free = ~np.asarray(felt.garment.pinned)
-            assert np.median(apart[free]) < 5e-3
+            assert np.median(apart[free]) < 3e-3
 
 
 def test_the_garment_that_feels_is_skinned_as_the_one_that_is_shown(coarse, motion):
-    """Before relaxation the two are apart by no more than their templates."""
+    """Before relaxation the two are apart by no more than their templates, on any body."""
     felt, garment = coarse.experiment.scene.felt, coarse.experiment.garment
     free, own = ~np.asarray(felt.garment.pinned), storage.load_garment("skirt_1000", coarse.experiment.body)
-    np.testing.assert_allclose(np.sum(felt.garment.weights, axis=1), 1.0, atol=1e-5)
-    np.testing.assert_array_equal(felt.garment.weights[~free], own.weights[~free])
     of_templates = felt.on_garment.interpolated(np.asarray(garment.vertices)) - own.vertices
     code = 0.5 * jax.random.normal(jax.random.key(2), coarse.model().network.code_bounds.low.shape)
 
@@ -172,7 +170,8 @@ def test_the_garment_that_feels_is_skinned_as_the_one_that_is_shown(coarse, moti
         )
         return drape.shown(model, code, inference._transforms(model, rotations, joints))
 
-    apart = felt.on_garment.interpolated(shown(coarse.model())) - shown(coarse.model(coarse=True))
+    whole, rough = (coarse.model(betas=np.ones(10), coarse=flag) for flag in (False, True))
+    apart = felt.on_garment.interpolated(shown(whole)) - shown(rough)
     apart, of_templates = (np.linalg.norm(x, axis=1)[free] for x in (apart, of_templates))
     assert np.mean(apart) < 1.5 * np.mean(of_templates) + 1e-4
 
@@ -478,7 +477,10 @@ def test_a_packed_one_is_loaded_with_its_coarse_mesh_and_as_it_alone(coarse, for
     fine, rough = (loading.load(tmp_path / "coarse", coarse=flag) for flag in (False, True))
     assert fine.network.predictor.felt is not None and rough.network.predictor.felt is None
     np.testing.assert_array_equal(rough.wearer.template, fine.wearer.cloth.template)
-    np.testing.assert_array_equal(rough.faces, coarse.experiment.scene.felt.garment.faces)
+    felt = coarse.experiment.scene.felt.garment
+    np.testing.assert_array_equal(rough.faces, felt.faces)
+    for weights in (rough.network.weights, fine.network.predictor.felt.weights):
+        np.testing.assert_allclose(weights, felt.weights.T, atol=1e-6)
     np.testing.assert_allclose(rough.network.shapes, fine.network.predictor.felt.shapes, atol=1e-7)
     assert rough.config.garment == "skirt_1000" and not rough.config.model.felt
     out = tmp_path / "c.safetensors"
