@@ -24,6 +24,7 @@ def main(argv: list[str]) -> None:
     cli.model_argument(parser, about="; such as experiments.tune left")
     parser.add_argument("name", help="of the garment")
     parser.add_argument("--jobs", type=int, default=1, help="processes that measure at once")
+    parser.add_argument("--motions", nargs="+", default=None, help="to measure on; default: those of the protocol")
     arguments = parser.parse_args(argv)
     run, folder = trained.find(arguments.model), trained.MODELS / arguments.name
     if trained.packed(run):
@@ -41,7 +42,7 @@ def main(argv: list[str]) -> None:
             "hours": seconds / 3600,
         }
     about["commit"] = commit(Path(__file__).parents[1])
-    reports = evaluate_packed({arguments.name: packed}, jobs=arguments.jobs)
+    reports = evaluate_packed({arguments.name: packed}, arguments.motions, arguments.jobs)
     (packed / trained.REPORT).write_text(json.dumps(about | reports[arguments.name], indent=1) + "\n")
     folder.mkdir(parents=True, exist_ok=True)
     for name in (trained.WEIGHTS, trained.CONFIG, trained.REPORT) if packed.resolve() != folder.resolve() else ():

