@@ -134,9 +134,7 @@ def _worst(config: Config, report: dict) -> list[str]:
             shown = {"none": "no push"}.get(name, name.removesuffix(".motion"))
             rows.append(f"| {kind} | {shown} | {gaps[name]:.2f} | {sum(gaps.values()) / len(gaps):.2f} |")
     clip = Path(config.evaluation.motions[0]).stem
-    about = (
-        f"Characters and pushes are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
-    )
+    about = f"Characters and pushes are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
     return ["## Where it is worst", about, "\n".join(rows)]
 
 
