@@ -51,7 +51,7 @@ def card(folder: Path) -> str:
     report = json.loads((folder / trained.REPORT).read_text())
     return (
         "\n\n".join(
-            [f"# {folder.name}", *_about(config, folder.name, report), *_figures(report), *_worst(config, report)]
+            [f"# {folder.name}", *_about(config, folder.name, report), *_figures(report), *_worst(report)]
             + _training(folder, report)
         )
         + "\n"
@@ -123,7 +123,7 @@ def _figures(report: dict) -> list[str]:
     ]
 
 
-def _worst(config: Config, report: dict) -> list[str]:
+def _worst(report: dict) -> list[str]:
     """Return the section on the motion, the character and the push on which Psi is worst."""
     rows = ["| | worst | hold gap there | mean |", "|---|---|---|---|"]
     groups = {"motion": "motions", "character": "wearers", "push": "pushed"}
@@ -133,7 +133,7 @@ def _worst(config: Config, report: dict) -> list[str]:
             name = max(gaps, key=gaps.__getitem__)
             shown = {"none": "no push"}.get(name, name.removesuffix(".motion"))
             rows.append(f"| {kind} | {shown} | {gaps[name]:.2f} | {sum(gaps.values()) / len(gaps):.2f} |")
-    clip = Path(config.evaluation.motions[0]).stem
+    clip = next(iter(report["motions"])).removesuffix(".motion")
     about = f"Characters and pushes are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
     return ["## Where it is worst", about, "\n".join(rows)]
 

@@ -241,16 +241,15 @@ def on_mesh(model: Model, garment: Garment, betas: Array) -> Model:
     if len(model.moving) < len(model.names) or len(model.network.shapes) != model.config.model.blendshapes:
         raise ValueError("this model is specialised already: put it on the other mesh first")
     template = np.asarray(skinning.shaped_vertices(garment, jnp.asarray(betas, jnp.float32)))
-    around, shares = correspondence.on_mesh(template, np.asarray(model.wearer.template).T, np.asarray(model.faces))
-    pinned = np.asarray(garment.pinned)
-    weights = np.einsum("jvi,vi->jv", np.asarray(model.network.weights)[:, around], shares)
-    weights = np.where(pinned, np.asarray(garment.weights).T, weights)
-    shares = np.where(pinned[:, None], 0.0, shares)
+    placed = correspondence.on_mesh(template, np.asarray(model.wearer.template).T, np.asarray(model.faces))
+    pinned = np.asarray(garment.pinned)[:, None]
+    weights = np.where(pinned, garment.weights, placed.interpolated(model.network.weights.T))
+    around, shares = placed.corners, np.where(pinned, 0.0, placed.shares)
     shapes = np.einsum("kcvi,vi->kcv", np.asarray(_rows(model.network))[:, :, around], shares)
     model = _feeling_apart(model, around, shares)
     network = model.network._replace(
         shapes=jnp.asarray(shapes.reshape(len(shapes), -1)),
-        weights=jnp.asarray(weights),
+        weights=jnp.asarray(weights.T),
     )
     return dataclasses.replace(
         model,

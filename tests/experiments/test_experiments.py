@@ -162,9 +162,16 @@ def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, mon
     measured = measured["evaluation"] | {name: measured[name] for name in ("motions", "pushed", "garment")}
     measured["wearers"] = json.loads((trained.find("dress") / trained.REPORT).read_text())["wearers"]
     monkeypatch.setattr(trained, "MODELS", tmp_path)
-    monkeypatch.setattr(ship, "evaluate_packed", lambda folders, *_: dict.fromkeys((*folders, "mean"), measured))
+    given = []
+
+    def evaluate_packed(folders, *rest):
+        given.append(rest)
+        return dict.fromkeys((*folders, "mean"), measured)
+
+    monkeypatch.setattr(ship, "evaluate_packed", evaluate_packed)
     monkeypatch.setattr(ship, "table", str)
-    ship.main([str(finished), "shirt"])
+    ship.main([str(finished), "shirt", "--motions", "walk_3", "--jobs", "2"])
+    assert given == [(["walk_3"], 2)]
     assert trained.shipped() == ("shirt",) and "commit" not in trained.provenance(tmp_path / "shirt")
     text = (tmp_path / "shirt" / "README.md").read_text()
     worst = max(measured["wearers"], key=lambda name: measured["wearers"][name]["psi"]["hold_gap"])
