@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import igl
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -150,6 +151,13 @@ def test_a_waist_that_is_pinned_is_pinned_on_any_mesh():
     fine = specialise.on_mesh(model, garment, np.zeros(10))
     still = np.abs(np.asarray(fine.network.shapes).reshape(len(fine.network.shapes), 3, -1)).max(axis=(0, 1)) == 0
     np.testing.assert_array_equal(still, garment.pinned)
+    # the skinning is that of the model where the mesh lies on it, and of the file where it is pinned
+    own, found = np.asarray(model.network.weights).T, np.asarray(fine.network.weights).T
+    places, faces = np.float64(model.wearer.template).T, np.asarray(model.faces, np.int64)
+    corners = own[faces[igl.point_mesh_squared_distance(np.float64(fine.wearer.template).T, places, faces)[1]]]
+    low, high = corners.min(axis=1) - 1e-5, corners.max(axis=1) + 1e-5
+    assert ((low <= found) & (found <= high))[~still].all()
+    np.testing.assert_allclose(found[still], garment.weights[still], atol=1e-6)
 
 
 def test_fewer_shapes_bear_eight_bits():
