@@ -27,7 +27,7 @@ TOY = [
     "--stage1.steps", "60", "--stage1.pool", "4", "--stage2.steps", "40", "--stage2.sequences", "4",
     "--stage2.frames", "12", "--stage2.batch", "4", "--stage2.rollout", "2", "--model.width", "8",
     "--model.latent", "64", "--model.blendshapes", "12", "--evaluation.gap-frames", "1",
-    "--evaluation.solver-frames", "12", "--evaluation.long-frames", "40",
+    "--evaluation.solver-frames", "12", "--evaluation.long-frames", "40", "--evaluation.frames", "42",
     "--evaluation.animation-frames", "6", "--shapes.sequences", "2", "--shapes.frames", "6",
     "--shapes.descent-steps", "3", "--model.descent-steps", "2", "--model.descent-samples", "2",
     "--labels.rounds", "2", "--labels.simulations", "2", "--labels.frames", "4", "--labels.descent-steps", "2",
@@ -52,6 +52,7 @@ def finished(tmp_path_factory):
     directory = tmp_path_factory.mktemp("runs") / "toy"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measures, "CHARACTERS_GAPS", 1)  # steps of the solver, which are the longest of all
+        patch.setattr(measures, "PUSHES", {name: measures.PUSHES[name] for name in ("none", "gust")})
         quickstart.main([*TOY, "--directory", str(directory)])
     return directory
 

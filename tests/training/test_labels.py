@@ -73,27 +73,34 @@ def test_labels_are_of_what_a_psi_that_relaxes_sees_and_decodes(toy):
     policy = labels.Policy(state.params, state.normalizers, params["garment"], params["inverse_hessian"])
     found = jax.jit(labels.make_segment(scene, config))((jax.random.key(7), one), policy, clips).labels
     character = pool.dressed(scene, one.betas, one.material, config)
-    matched = []
-    for poses in (motion_clips.poses(clips, one.frame), motion_clips.standing(motion_clips.poses(clips, one.frame))):
+
+    @jax.jit
+    def expected(poses):
         window = characters.window(scene, character, poses)
         step = time_step.time_step(scene, character, one.cloth, window, jnp.float32(1 / config.fps), config)
 
-        def skinned(code, window=window):
+        def skinned(code):
             displaced = phi.displacement(params["garment"], scene, code, config.model)
             return phi.skinned(displaced, scene, character, window.following)
 
-        given = (params["garment"], scene, character, one.cloth.latent, window, config.model)
         pulls = forces.reduced(
             skinned,
             one.cloth.latent, characters.carried(one.cloth.position, window), step,
             characters.surface(scene, window.following), scene.clusters, scene.mesh, config.physics,
         )  # fmt: skip
-        least = incremental_potential.potential(phi.decode(*given), step, scene.mesh, config.physics)
+        relaxed = phi.decode(params["garment"], scene, character, one.cloth.latent, window, config.model)
+        return pulls, *[
+            incremental_potential.potential(x, step, scene.mesh, config.physics)
+            for x in (relaxed, skinned(one.cloth.latent))
+        ]
+
+    matched = []
+    for poses in (motion_clips.poses(clips, one.frame), motion_clips.standing(motion_clips.poses(clips, one.frame))):
+        pulls, least, unrelaxed = expected(poses)
         matched.append(
             np.allclose(found.forces[0], pulls, rtol=1e-3, atol=1e-4 * np.abs(pulls).max())
             and np.allclose(found.held[0], least, rtol=1e-4)
         )
-        unrelaxed = incremental_potential.potential(skinned(one.cloth.latent), step, scene.mesh, config.physics)
         assert abs(least / unrelaxed - 1) > 1e-3
     assert sum(matched) == 1  # the body moves, or it holds its pose
 
