@@ -24,6 +24,7 @@ from data_prep.templates import build
 from data_prep.user_mesh import MAX_VERTICES, MIN_VERTICES, Answers, bring
 
 OF_MESH = ("units", "up", "pin", "object", "shift", "turn", "sew", "outer", "allow", "loose", "flip", "cloth")
+MOST_SEWN = 50.0  # mm
 PIN_COLOUR = (0.85, 0.1, 0.1)
 
 
@@ -81,6 +82,8 @@ def main(args: Arguments) -> None:
         raise ValueError("give either --template or --mesh")
     if args.vertices is not None and not MIN_VERTICES <= args.vertices <= MAX_VERTICES:
         raise ValueError(f"--vertices {args.vertices}: {MIN_VERTICES} to {MAX_VERTICES} can be trained")
+    if not 0.0 <= args.sew <= MOST_SEWN:
+        raise ValueError(f"--sew {args.sew:g}: 0 to {MOST_SEWN:g} mm")
     answers = Answers(
         placement=Placement(args.units, args.up, args.shift, args.turn),
         pin=args.pin,

@@ -20,6 +20,7 @@ DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: 
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 SUFFIXES = (".glb", ".gltf", ".vrm", ".vrma")
 READ = ("KHR_mesh_quantization", "KHR_texture", "KHR_lights", "KHR_materials", "EXT_texture", "VRM")  # beginnings
+COPIES = "EXT_mesh_gpu_instancing"
 GLB = b"glTF"
 TRIANGLES = 4  # the mode of a primitive; strips and fans follow
 MOST = 10_000_000  # entries of an accessor
@@ -30,6 +31,7 @@ class Skinned(NamedTuple):
     """How joints carry the vertices of a part."""
 
     skin: int
+    turned: float  # degrees, by which the scene turns its joints against each other, beside how it was bound
     bound: np.ndarray  # [V, 3] as the mesh has them, with its default morph weights
     joints: np.ndarray  # [V, n] int64, among those of the skin
     weights: np.ndarray  # [V, n], of sum 1 or 0
@@ -82,6 +84,9 @@ class Document:
             data = next((chunk for kind, chunk in chunks if kind == b"JSON"), b"")
             self.binary = next((chunk for kind, chunk in chunks if kind == b"BIN\0"), b"")
         self.json: dict[str, Any] = json.loads(data)
+        version = str(self.json.get("asset", {}).get("version", "2.0"))
+        if not version.startswith("2"):
+            raise ValueError(f"glTF of version {version}: export it as glTF 2.0")
         needed = [name for name in self.json.get("extensionsRequired", ()) if not name.startswith(READ)]
         if needed:
             raise ValueError(f"compressed or special ({', '.join(needed)}): export it without")
@@ -150,7 +155,12 @@ class Document:
 
     def skin_transforms(self, index: int, places: dict[int, np.ndarray]) -> np.ndarray:
         """Return the matrices [J, 4, 4] of the joints of a skin, from its mesh to the world."""
-        joints = np.stack([places[joint] for joint in self.entries("skins")[index]["joints"]])
+        nodes = self.entries("skins")[index]["joints"]
+        absent = [node for node in nodes if node not in places]
+        if absent:
+            name = self.entries("nodes")[absent[0]].get("name", absent[0])
+            raise ValueError(f"the joint {name!r} of a skin is not in the scene: export it with its whole skeleton")
+        joints = np.stack([places[node] for node in nodes])
         inverse = self.inverse_bind(index)
         return joints if inverse is None else joints @ inverse
 
@@ -258,13 +268,19 @@ def parts(document: Document) -> list[Part]:
     """Read the triangles of all objects in the scene of a file.
 
     Raises:
-        ValueError: for strips and fans of triangles, or data that are cut short.
+        ValueError: for strips and fans of triangles, copies by an extension, objects outside of the scene, or data that
+            are cut short.
     """
     places, found = document.places(), []
+    meant = [node.get("name", k) for k, node in enumerate(document.entries("nodes")) if "mesh" in node]
+    if meant and not any("mesh" in document.entries("nodes")[index] for index in places):
+        raise ValueError(f"its objects ({', '.join(map(str, meant))}) are not in its scene: export what is shown")
     for index, place in places.items():
         node = document.entries("nodes")[index]
         if "mesh" not in node:
             continue
+        if COPIES in node.get("extensions", {}):
+            raise ValueError(f"copies of one object ({COPIES}): export each as an object of its own")
         mesh = document.entries("meshes")[node["mesh"]]
         for primitive in mesh["primitives"]:
             attributes = primitive["attributes"]
@@ -279,8 +295,9 @@ def parts(document: Document) -> list[Part]:
                 vertices = vertices + weight * morph
             skinned = None
             if "skin" in node and "JOINTS_0" in attributes:  # its node does not move a skinned mesh
-                skinned = _skinned(document, node["skin"], attributes, vertices)
-                vertices = carried(skinned, document.skin_transforms(node["skin"], places))
+                matrices = document.skin_transforms(node["skin"], places)
+                skinned = _skinned(document, node["skin"], attributes, vertices, matrices)
+                vertices = carried(skinned, matrices)
             else:
                 vertices = vertices @ place[:3, :3].T + place[:3, 3]
             count = len(vertices)
@@ -305,7 +322,7 @@ def _morphs(document: Document, mesh: dict, primitive: dict) -> dict[str, np.nda
     return morphs
 
 
-def _skinned(document: Document, skin: int, attributes: dict, vertices: np.ndarray) -> Skinned:
+def _skinned(document: Document, skin: int, attributes: dict, vertices: np.ndarray, matrices: np.ndarray) -> Skinned:
     joints, weights = [], []
     for group in range(4):
         if f"JOINTS_{group}" not in attributes:
@@ -314,7 +331,18 @@ def _skinned(document: Document, skin: int, attributes: dict, vertices: np.ndarr
         weights.append(document.accessor(attributes[f"WEIGHTS_{group}"]).astype(np.float64))
     joints, weights = (np.concatenate(each, axis=1) for each in (joints, weights))
     total = weights.sum(axis=1, keepdims=True)
-    return Skinned(skin, vertices, joints, weights / np.where(total > 0, total, 1.0))
+    weights = weights / np.where(total > 0, total, 1.0)
+    pulling = np.unique(joints[weights > 0.01])
+    turns = nearest_rotations(matrices[pulling, :3, :3]) if len(pulling) else np.eye(3)[None]
+    cosine = (np.einsum("jab,ab->j", turns, turns[0]) - 1.0) / 2.0
+    turned = float(np.degrees(np.arccos(np.clip(cosine.min(), -1.0, 1.0))))
+    return Skinned(skin, turned, vertices, joints, weights)
+
+
+def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
+    """Return the rotations [..., 3, 3] nearest to matrices that may scale."""
+    left, _, right = np.linalg.svd(matrices)
+    return left @ right
 
 
 def carried(skinned: Skinned, matrices: np.ndarray) -> np.ndarray:

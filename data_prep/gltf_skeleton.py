@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.body.joint_names import LIMBS, SIDES
 from data_prep import skeleton
-from data_prep.gltf_file import Document
+from data_prep.gltf_file import Document, nearest_rotations
 
 PART_OF_VRM = {part: part for part in skeleton.MIDDLE} | {
     f"{side}{bone}": f"{side} {part}" for side in SIDES for part, (_, _, bone) in LIMBS.items()
@@ -71,9 +71,3 @@ def to_world(document: Document, skin: int, nodes: list[int], places: np.ndarray
     """Return the matrix [4, 4] from the mesh of a skin to the world, in which it was bound."""
     inverse, joints = document.inverse_bind(skin), document.entries("skins")[skin]["joints"]
     return np.eye(4) if inverse is None else places[nodes.index(joints[0])] @ inverse[0]
-
-
-def nearest_rotations(matrices: np.ndarray) -> np.ndarray:
-    """Return the rotations [..., 3, 3] nearest to matrices that may scale."""
-    left, _, right = np.linalg.svd(matrices)
-    return left @ right

@@ -26,7 +26,7 @@ def marked(path: str | Path, mesh: Mesh, what: str, flag: str) -> np.ndarray:
     if what == "red":
         if not mesh.red.any():
             raise ValueError(
-                f"{path}: {flag} red, but no vertex is painted red (.ply and .glb keep colours of vertices)"
+                f"{path}: {flag} red, but no vertex is painted red (.ply, .obj and .glb keep colours of vertices)"
             )
         return mesh.red
     if what.startswith("object:"):

@@ -1,15 +1,15 @@
 """Files of triangle meshes in the formats of modelling programs, with their colours and objects."""
 
-import io
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
-from data_prep import gltf_file
+from data_prep import gltf_file, polygon_file
 
-BETWEEN = "\x1f"  # names of an object, its group and its material
+POSED = 2.0  # degrees between two joints, from which a skeleton is in another pose than it was bound in
+SRGB = 1 / 2.2  # the power of a linear colour, as glTF has them, that a screen shows
 
 
 class Mesh(NamedTuple):
@@ -19,6 +19,7 @@ class Mesh(NamedTuple):
     faces: np.ndarray  # [F, 3]
     red: np.ndarray  # [V] bool, painted red
     objects: dict[str, np.ndarray]  # by name, [V] bool
+    notes: tuple[str, ...] = ()  # what the user should know of how it was read
 
 
 def read(path: str | Path) -> Mesh:
@@ -31,14 +32,13 @@ def read(path: str | Path) -> Mesh:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        parts = _of_gltf(path) if path.suffix.lower() in gltf_file.SUFFIXES else _of_trimesh(path)
+        parts = next((read for suffixes, read in READERS.items() if path.suffix.lower() in suffixes), _of_trimesh)(path)
     except Exception as error:  # whatever a reader of a damaged file of some format raises
         hint = "export it as .obj or .glb"
-        if path.suffix.lower() == ".ply":
-            hint = "export it with triangles only, or as .obj or .glb"
         raise ValueError(f"{path}: not a mesh that can be read ({_brief(error)}); {hint}") from error
+    parts = [part for part in parts if len(part.faces)]
     if not parts:
-        raise ValueError(f"{path}: no triangles; export the mesh with its faces")
+        raise ValueError(f"{path}: no triangles, or it is cut short; export the mesh with its faces")
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts)])
@@ -51,7 +51,8 @@ def read(path: str | Path) -> Mesh:
     for part, start in zip(parts, starts):
         for name in part.names:
             objects[name][part.faces + start] = True
-    return Mesh(vertices, faces, np.concatenate([part.red for part in parts]), objects)
+    notes = tuple(dict.fromkeys(part.note for part in parts if part.note))
+    return Mesh(vertices, faces, np.concatenate([part.red for part in parts]), objects, notes)
 
 
 class _Part(NamedTuple):
@@ -61,59 +62,46 @@ class _Part(NamedTuple):
     vertices: np.ndarray  # [V, 3] float64
     faces: np.ndarray  # [F, 3] int64
     red: np.ndarray  # [V] bool
+    note: str = ""
 
 
-def _of_trimesh(path: Path) -> list[_Part]:
-    options = {"process": False, "split_objects": True, "group_material": False, "skip_materials": True}
-    if path.suffix.lower() == ".obj":
-        text = _with_groups(path.read_text(encoding="utf-8-sig", errors="replace"))
-        scene = trimesh.load_scene(io.StringIO(text), file_type="obj", **options)
-    else:
-        scene = trimesh.load_scene(path, **options)
-    parts = []
-    for node in scene.graph.nodes_geometry:
-        place, name = scene.graph[node]
-        mesh = scene.geometry[name]
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            mesh = mesh.copy().apply_transform(place)
-            names = dict.fromkeys(word for label in (node, name) for word in label.split(BETWEEN) if word)
-            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-            parts.append(_Part(tuple(names), vertices, faces, _red(mesh)))
+def _of_polygons(path: Path) -> list[_Part]:
+    whole = polygon_file.read(path)
+    red, parts = _is_red(whole.colours, len(whole.vertices)), []
+    for names, polygons in whole.groups.items():
+        faces = polygon_file.triangles(whole.vertices, polygons)
+        used, index = np.unique(faces, return_inverse=True)
+        parts.append(_Part(names, whole.vertices[used], index.reshape(-1, 3), red[used]))
     return parts
 
 
-def _with_groups(text: str) -> str:
-    """Return an OBJ file's text whose objects also are its groups and materials, with indices that count from 1.
-
-    Programs such as Maya and Marvelous Designer write parts as groups. Relative indices count back from the last.
-    """
-    counts, current, lines = {"v": 0, "vt": 0, "vn": 0}, {"o": "", "g": "", "usemtl": ""}, []
-    for line in text.replace("\\\n", " ").splitlines():
-        key, _, rest = line.strip().partition(" ")
-        if key in counts:
-            counts[key] += 1
-        elif key in current:
-            current[key] = rest.strip()
-            label = BETWEEN.join(dict.fromkeys(name for name in current.values() if name and name != "default"))
-            line = f"o {label or 'default'}"
-        elif key == "f" and "-" in rest:
-            corners = [corner.split("/") for corner in rest.split()]
-            line = " ".join(["f", *("/".join(map(_absolute, corner, counts.values())) for corner in corners)])
-        lines.append(line)
-    return "\n".join(lines) + "\n"
-
-
-def _absolute(index: str, count: int) -> str:
-    return str(count + 1 + int(index)) if index.startswith("-") else index
+def _of_trimesh(path: Path) -> list[_Part]:
+    scene, parts = trimesh.load_scene(path, process=False), []
+    for node in scene.graph.nodes_geometry:
+        place, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if isinstance(mesh, trimesh.Trimesh):
+            mesh = mesh.copy().apply_transform(place)
+            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+            names = tuple(dict.fromkeys((node, name)))
+            parts.append(_Part(names, vertices, faces, np.zeros(len(vertices), bool)))
+    return parts
 
 
 def _of_gltf(path: Path) -> list[_Part]:
-    parts = [part for part in gltf_file.parts(gltf_file.Document(path)) if len(part.faces)]
-    colours = [None if part.colours is None else 255.0 * part.colours for part in parts]
-    return [
-        _Part(part.names, part.vertices, part.faces, _is_red(own, len(part.vertices)))
-        for part, own in zip(parts, colours, strict=True)
-    ]
+    found = []
+    for part in gltf_file.parts(gltf_file.Document(path)):
+        if part.skinned is not None and (bare := int((part.skinned.weights.sum(axis=1) == 0).sum())):
+            raise ValueError(f"{bare} vertices of {' '.join(part.names)} follow no joint")
+        colours = None if part.colours is None else 255.0 * np.maximum(part.colours, 0.0) ** SRGB
+        red, note = _is_red(colours, len(part.vertices)), ""
+        if part.skinned is not None and part.skinned.turned > POSED:
+            note = (
+                f"its skeleton stands {part.skinned.turned:.0f} degrees from the pose that it was bound in, which is "
+                "that of a body from the same file: reset its pose and export it again"
+            )
+        found.append(_Part(part.names, part.vertices, part.faces, red, note))
+    return found
 
 
 def _brief(error: Exception) -> str:
@@ -121,15 +109,12 @@ def _brief(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def _red(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return which vertices [V] bool are painted red."""
-    painted = mesh.visual.kind == "vertex"
-    return _is_red(np.asarray(mesh.visual.vertex_colors) if painted else None, len(mesh.vertices))
-
-
 def _is_red(colours: np.ndarray | None, count: int) -> np.ndarray:
     """Return which of `count` vertices are red, of colours [V, 3 or more] from 0 to 255, if there are any."""
     if colours is None:
         return np.zeros(count, bool)
-    red, green, blue = colours[:, :3].astype(int).T
+    red, green, blue = colours[:, :3].T
     return (red > 150) & (green < 100) & (blue < 100)
+
+
+READERS = {gltf_file.SUFFIXES: _of_gltf, (".obj", ".ply", ".off"): _of_polygons}

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from clothjax.geometry.topology import components
 from clothjax.types import Body
 from data_prep.dressing import CLEARANCE, WINDING
 from data_prep.mesh_file import Mesh
@@ -21,6 +22,9 @@ QUARTERS = (0, 90, 180, 270)  # degrees
 INSIDE_PENALTY = 10  # weight of the depth inside the body over the distance to it, in comparing units
 ALIKE = 2.0  # times the least cost, up to which places fit alike
 ON_BODY = 0.003  # m, from the body, of an object that is the body
+COVERED = 0.9  # of the body's vertices, that are on an object which is the body
+FLAT, WELDED = 1e-3, 1e-4  # of a mesh's size: from its plane, of a part that is flat; between vertices at one place
+MOSTLY = 0.5  # of a mesh's area, that is flat in a pattern before it is draped
 BELOW = 0.02  # m, below the soles
 AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
 SAMPLE = 500  # vertices that stand for all
@@ -47,27 +51,33 @@ def check_place(path: str | Path, vertices: np.ndarray, surface: Surface, place:
         ValueError: naming the file, and the units and axis in which it would be.
     """
     height, sample = np.ptp(surface[0][:, 1]), vertices[:: max(1, len(vertices) // SAMPLE)]
+    soles = (0.0, float(surface[0][:, 1].min()), 0.0)
     places = [place]
     for units, scale in METRES.items():
         if 0.15 * height < scale * np.ptp(vertices, axis=0).max() < 1.5 * height:
             others = [up for up in TO_Y_UP if (units, up) != (place.units, place.up)]
             turns = [(place.turn + turn) % 360 for turn in QUARTERS]
             places += [place._replace(units=units, up=up, turn=turn) for up in others for turn in turns]
+    if place.shift == Placement().shift:  # many programs have the soles at zero
+        places += [it._replace(shift=soles) for it in places if it(sample)[:, 1].min() > -BELOW]
     distance, depth = _fit(sample, surface, places)
     cost = np.where(distance < MAX_MEAN_DISTANCE, distance + INSIDE_PENALTY * depth, np.inf)
     large = 0.05 * height < METRES[place.units] * np.ptp(vertices, axis=0).max() < 1.5 * height
-    if large and cost[0] < np.inf and cost[0] <= 2 * cost.min() + 0.01:
+    if not large:
+        cost[[it.units == place.units for it in places]] = np.inf
+    if cost[0] < np.inf and cost[0] <= 2 * cost.min() + 0.01:
         return
     size = np.ptp(vertices, axis=0)
     size_text = f"{path}: {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {place.units}, {place.up.upper()} up"
     if cost.min() < np.inf:
         meant = _likeliest(places, cost, place)
         flags = f"--units {meant.units} --up {meant.up}" + f" --turn {meant.turn:.0f}" * (meant.turn != place.turn)
+        flags += _shifted(meant, place)
         raise ValueError(f"{size_text}: that is not around the body. Is it meant to be {flags}?")
     raise ValueError(
         f"{size_text}: not around the body in any unit. The body is {height:.2f} m high with its middle at "
         f"{np.round(0.5 * (surface[0].min(axis=0) + surface[0].max(axis=0)), 2)}: move the mesh onto the body in its "
-        "canonical pose"
+        "canonical pose, as by --shift"
     )
 
 
@@ -83,18 +93,43 @@ def check_objects(path: str | Path, mesh: Mesh, placed: np.ndarray, surface: Sur
     Raises:
         ValueError: naming that object and the others.
     """
-    for name, which in mesh.objects.items():
-        if which.all() or which.sum() < len(surface[0]) / 10:
-            continue
+    whole = {"": np.ones(len(placed), bool)}
+    for name, which in (mesh.objects | whole).items():
         own = placed[which]
-        apart = np.abs(igl.signed_distance(own[:: max(1, len(own) // SAMPLE)], *surface, sign_type=WINDING)[0])
-        covered = cKDTree(own).query(surface[0])[0]  # it is all of the body, not what lies tightly on it
-        if np.median(apart) < ON_BODY and np.quantile(covered, 0.9) < 10 * ON_BODY:
+        if len(own) < len(surface[0]) / 10:
+            continue
+        apart = np.abs(igl.signed_distance(own, *surface, sign_type=WINDING)[0])
+        on_body = own[apart < ON_BODY]
+        if not len(on_body) or (name and len(on_body) < 0.5 * len(own)):
+            continue
+        covered = cKDTree(on_body).query(surface[0])[0]  # it is all of the body, not what lies tightly on it
+        if np.quantile(covered, COVERED) < 10 * ON_BODY:
             others = [other for other in mesh.objects if not (mesh.objects[other] & which).any()]
-            raise ValueError(
-                f"{path}: its object {name!r} is the body itself; there are {', '.join(mesh.objects)}: choose the "
-                f"garment, as with --object {others[0] if others else 'NAME'}"
-            )
+            what = f"its object {name!r} is the body itself" if name and not which.all() else "it holds the body itself"
+            remedy = f"choose the garment, as with --object {others[0]}" if others else "delete it from the file"
+            raise ValueError(f"{path}: {what}; there are {', '.join(mesh.objects) or 'no objects'}: {remedy}")
+
+
+def check_draped(path: str | Path, mesh: Mesh, allow: bool) -> None:
+    """Refuse a sewing pattern: panels that are flat, before they were sewn and draped.
+
+    Raises:
+        ValueError: naming the file, and what to give in its place.
+    """
+    size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-9)
+    places, welded = np.unique(np.round(mesh.vertices / (WELDED * size)), axis=0, return_inverse=True)
+    part = components(len(places), welded[mesh.faces])[welded[mesh.faces[:, 0]]]
+    area, flat = igl.doublearea(mesh.vertices, mesh.faces), 0.0
+    for number in np.unique(part):
+        points = mesh.vertices[np.unique(mesh.faces[part == number])]
+        around = points - points.mean(axis=0)
+        if len(points) > 3 and np.abs(around @ np.linalg.svd(around, full_matrices=False)[2][2]).max() < FLAT * size:
+            flat += area[part == number].sum()
+    if flat > MOSTLY * area.sum() and not allow:
+        raise ValueError(
+            f"{path}: {100 * flat / area.sum():.0f} % of it lies in flat parts, as a sewing pattern does before it is "
+            "sewn and draped: give the draped mesh (of GarmentCode NAME_sim.obj); --allow takes it as it is"
+        )
 
 
 def better_place(vertices: np.ndarray, surface: Surface, place: Placement) -> str:
@@ -119,8 +154,12 @@ def better_place(vertices: np.ndarray, surface: Surface, place: Placement) -> st
         return ""
     best = [place, *places][int(np.where(better, depth + 0.02 * distance, np.inf).argmin())]
     flags = [f"--up {best.up}"] * (best.up != place.up) + [f"--turn {best.turn:.0f}"] * (best.turn != place.turn)
-    flags += ["--shift " + " ".join(f"{x + 0.0:.2f}" for x in best.shift)] * (best.shift != place.shift)
-    return f"It would be nearer with {' '.join(flags)}; "
+    return f"It would be nearer with {' '.join(flags)}{_shifted(best, place)}; ".replace("with  ", "with ")
+
+
+def _shifted(meant: Placement, place: Placement) -> str:
+    """Return the flag that shifts a mesh as one place does, if another does not."""
+    return " --shift " + " ".join(f"{x + 0.0:.2f}" for x in meant.shift) if meant.shift != place.shift else ""
 
 
 def _likeliest(places: list[Placement], cost: np.ndarray, place: Placement) -> Placement:
@@ -149,5 +188,5 @@ def worn(vertices: np.ndarray, faces: np.ndarray, body: Body) -> str:
     around = np.abs(igl.fast_winding_number(vertices, faces, np.asarray(body.joints, np.float64)))
     doubts = ["it goes around no part of the body"] * bool(around.max() < AROUND)
     doubts += ["it reaches below the soles"] * bool(low < soles - BELOW)
-    said = f"worn from {low - soles:.2f} to {high - soles:.2f} m above the soles"
+    said = f"worn from {low - soles:.2f} to {high - soles:.2f} m above the soles, at {low:.2f} to {high:.2f} m"
     return f"{said}, but {' and '.join(doubts)}: is it worn elsewhere?" if doubts else said

@@ -109,9 +109,10 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, dista
     Raises:
         ValueError: naming the file, the place, and the distance that sews it.
     """
-    loops = [_dense(vertices[loop]) for loop in igl.boundary_loop_all(igl.bfs_orient(faces)[0])]
-    if not loops:
+    borders = _borders(igl.bfs_orient(faces)[0])
+    if not borders:
         return []
+    loops = [_dense(vertices[loop]) for loop in borders]
     points, along = (np.concatenate(parts) for parts in zip(*loops, strict=True))
     number = np.concatenate([np.full(len(own), k) for k, (_, own) in enumerate(loops)])
     pairs = cKDTree(points).query_pairs(MAYBE_BESIDE, output_type="ndarray")
@@ -123,8 +124,11 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, dista
     between = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     for side in pairs.T:
         np.minimum.at(apart, side, between)
-    for reach, k in ((reach, k) for reach in (BESIDE, MAYBE_BESIDE) for k in range(len(loops))):
-        beside = (number == k) & (apart < reach)
+    for k, (own, _) in enumerate(loops):  # of a slit both sides are near along it
+        width = 2 * np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1] / len(own) ** 0.5
+        apart[number == k] = np.minimum(apart[number == k], width)
+    for reach in (BESIDE, MAYBE_BESIDE):
+        beside = apart < reach
         if SPACING * beside.sum() > LEAST_BESIDE:
             place, wide = np.round(points[beside][0], 2), max(np.quantile(apart[beside], 0.9), 1.01 * distance)
             sews = f"--sew {np.ceil(1e3 * wide):.0f} sews"
@@ -133,6 +137,28 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, dista
                 return [f"{said}, and stay open; {sews} them"]
             raise ValueError(f"{path}: {said}: a seam that is not sewn? {sews} it, --allow leaves it open")
     return []
+
+
+def _borders(faces: np.ndarray) -> list[np.ndarray]:
+    """Return the borders of a mesh whose faces [F, 3] agree in their turn, each its vertices in order.
+
+    At a vertex where several borders meet, a border goes on along the faces that it belongs to.
+    """
+    after = {(a, b): c for face in faces.tolist() for a, b, c in (face, [*face[1:], face[0]], [face[2], *face[:2]])}
+    starts, found = [edge for edge in after if edge[::-1] not in after], []
+    left = dict.fromkeys(starts)
+    for start in starts:
+        if start not in left:
+            continue
+        loop, edge = [], start
+        while edge in left:
+            del left[edge]
+            loop.append(edge[0])
+            edge = (edge[1], after[edge])
+            while edge[::-1] in after:  # around the vertex, to the next face without a neighbour
+                edge = (edge[0], after[edge[::-1]])
+        found.append(np.array(loop))
+    return found
 
 
 def _dense(loop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

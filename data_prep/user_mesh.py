@@ -11,14 +11,14 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from clothjax.geometry.topology import boundary_loops, components
+from clothjax.geometry.topology import boundary_loops, boundary_mask, components
 from clothjax.types import Body, Garment
 from data_prep import marks, mesh_file
 from data_prep.dressing import WINDING, dress, limbs, push_out
 from data_prep.layers import THICKEST, inside, looks_away, outer_side, sides
 from data_prep.mesh import compact, edge_table
 from data_prep.mesh_file import Mesh
-from data_prep.placement import Placement, Surface, better_place, check_objects, check_place, worn
+from data_prep.placement import Placement, Surface, better_place, check_draped, check_objects, check_place, worn
 from data_prep.remesh import resample
 from data_prep.seams import WELD_DISTANCE, check_seams, seams, sewn
 
@@ -78,17 +78,24 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     """
     mesh = _chosen(path, mesh_file.read(path), answers.objects)
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
+    check_draped(path, mesh, answers.allow)
     check_place(path, mesh.vertices, surface, answers.placement)
     placed = answers.placement(mesh.vertices)
     check_objects(path, mesh, placed, surface)
     working, index = _clean(path, placed, mesh.faces)
+    working = working.logged(*mesh.notes)
     working, index = _layers(path, working, index, surface, answers)
     working, index = _sew(path, working, index, answers)
+    _check_open(path, working, answers.allow)
     working = _log_seams(working, placed, mesh.faces[(index[mesh.faces] >= 0).all(axis=1)], answers.sew)
     at_place = marks.is_place(answers.pin)
     if not at_place:
         members = index[marks.marked(path, mesh, answers.pin, "--pin")]
-        working = working._replace(pinned=np.isin(np.arange(len(working.vertices)), members))
+        pinned = np.isin(np.arange(len(working.vertices)), members)
+        if not pinned.any() or pinned.all():
+            some = "all" if pinned.all() else "none"
+            raise ValueError(f"{path}: --pin {answers.pin} pins {some} of the garment's {len(pinned)} vertices")
+        working = working._replace(pinned=pinned)
     if answers.cloth:
         cloth, lines = marks.cloth(path, mesh, index, len(working.vertices), answers.cloth)
         working = working._replace(cloth=cloth).logged(*lines)
@@ -130,7 +137,8 @@ def _chosen(path: str | Path, mesh: Mesh, objects: tuple[str, ...]) -> Mesh:
     faces = mesh.faces[kept[mesh.faces].all(axis=1)]
     used = np.unique(faces)
     vertices, faces = compact(mesh.vertices, faces)
-    return Mesh(vertices, faces, mesh.red[used], {name: which[used] for name, which in mesh.objects.items()})
+    own = {name: which[used] for name, which in mesh.objects.items()}
+    return mesh._replace(vertices=vertices, faces=faces, red=mesh.red[used], objects=own)
 
 
 def _clean(path: str | Path, points: np.ndarray, faces: np.ndarray) -> tuple[Working, np.ndarray]:
@@ -226,6 +234,19 @@ def _sew(path: str | Path, working: Working, index: np.ndarray, answers: Answers
     return working, np.where(index < 0, -1, joined[index])
 
 
+def _check_open(path: str | Path, working: Working, allow: bool) -> None:
+    """Refuse a part without any border: cloth has one, something with thickness has none."""
+    vertices, faces = working.vertices, working.faces
+    part = components(len(vertices), faces)
+    closed = np.setdiff1d(part, part[boundary_mask(faces, len(vertices))])
+    if len(closed) and not allow:
+        place = np.round(vertices[part == closed[0]].mean(axis=0), 2)
+        raise ValueError(
+            f"{path}: the part around {place} m is closed, with no opening, as something thick is: leave it out "
+            "(--object), or delete its inner side; --allow takes it as cloth"
+        )
+
+
 def _log_seams(working: Working, points: np.ndarray, torn: np.ndarray, sew: float) -> Working:
     """Log how many pieces of the file, of vertices [V, 3] m and faces [F, 3], are joined along how many seams."""
     pieces, count = seams((points, torn), working.vertices, working.faces, 1e-3 * sew)
@@ -310,11 +331,15 @@ def _push_out(path: str | Path, working: Working, surface: Surface, in_file: np.
 def _log_counts(working: Working) -> Working:
     """Log the number of vertices, faces, parts, openings and pins."""
     vertices, faces, pinned = working.vertices, working.faces, working.pinned
-    parts = 1 + int(components(len(vertices), faces).max())
-    return working.logged(
+    part = components(len(vertices), faces)
+    parts, free = 1 + int(part.max()), 1 + int(part.max()) - len(np.unique(part[pinned]))
+    working = working.logged(
         f"{len(vertices)} vertices, {len(faces)} faces, {parts} part{'s' * (parts > 1)}, "
         f"{len(boundary_loops(faces))} openings, {int(pinned.sum())} vertices pinned"
     )
+    if not pinned.any() or not free:
+        return working
+    return working.logged(f"{free} of {parts} parts have no pinned vertex: nothing but the body holds them")
 
 
 def _uncovered_arms(points: np.ndarray, body: Body, names: tuple[str, ...]) -> np.ndarray:

@@ -317,3 +317,34 @@ def test_an_open_front_stays_open(thick, kind, sheet, body, names, save):
         made, _ = bring(path, body, names, TIGHT._replace(outer=True))
         assert off(made, *coat) < 1e-5 and len(made.vertices) == len(coat[0])
     assert len(boundary_loops(coat[1])) == OPENINGS[kind] - 1
+
+
+def tube(heights, radius, count):
+    """A tube of rings, each of `count` vertices."""
+    angle = 2 * np.pi * np.arange(count) / count
+    rings = [np.stack([radius * np.cos(angle), np.full(count, y), radius * np.sin(angle)], 1) for y in heights]
+    at = np.arange(len(heights) * count).reshape(len(heights), count)
+    a, b, c, d = at[:-1], np.roll(at[:-1], -1, 1), at[1:], np.roll(at[1:], -1, 1)
+    faces = np.stack([np.stack(corners, -1) for corners in ((a, b, d), (a, d, c))]).reshape(-1, 3)
+    return np.concatenate(rings), faces
+
+
+@pytest.mark.parametrize("upper, lower", [(64, 128), (40, 80), (90, 120), (30, 60)])
+def test_a_round_seam_whose_sides_have_other_vertices_is_noticed(upper, lower, body, names, save):
+    """A yoke and a skirt on one circle: their sides meet at some vertices, and are up to a millimetre apart between."""
+    path = save(tube(np.linspace(0.1, 0.0, 5), 0.22, upper), tube(np.linspace(0.0, -0.3, 10), 0.22, lower))
+    with pytest.raises(ValueError, match=r"two borders run \d\.\d mm beside each other.*--sew [12] sews it"):
+        bring(path, body, names, TIGHT)
+    made, said = bring(path, body, names, TIGHT._replace(sew=2.0))
+    assert len(boundary_loops(made.faces)) == 2 and "sewn: 2 pieces along 1 seam" in said
+
+
+@pytest.mark.parametrize("apart", [0.022, 0.03])
+def test_what_has_no_opening_is_no_cloth(apart, sheet, body, names, save):
+    """Thicker than layers are looked for."""
+    vertices, faces, _ = solid(*sheet, apart, out=apart)
+    for answers in (TIGHT, TIGHT._replace(outer=True)):
+        with pytest.raises(ValueError, match=r"the part around \[.*\] m is closed, with no opening"):
+            bring(save((vertices, faces)), body, names, answers)
+    made, _ = bring(save((vertices, faces)), body, names, TIGHT._replace(allow=True))
+    assert not boundary_loops(made.faces)

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from data_prep import gltf_file, mesh_file
+from data_prep import gltf_file, mesh_file, polygon_file
 from data_prep.gltf_file import DTYPES
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -139,7 +139,7 @@ def test_what_would_be_left_out_is_refused(tmp_path):
     huge.accessors[0] = {"componentType": 5126, "type": "VEC3", "count": 10**12}
     for file, told in (
         (strip, "as triangles"),
-        (far, "not a mesh that can be read"),
+        (far, "joint 'in no scene' of a skin is not in the scene"),
         (huge, "1000000000000"),
     ):
         with pytest.raises(ValueError, match=rf"a\.glb: .*({told})"):
@@ -180,3 +180,145 @@ def test_groups_and_materials_are_objects_and_indices_may_count_back(tmp_path):
     assert mesh.objects["shirt"].sum() == mesh.objects["linen"].sum() == len(mesh.vertices)
     assert mesh.vertices[mesh.objects["collar"]].tolist().count([0.0, 1.0, 0.0]) == 1
     assert mesh.objects["collar"].sum() == mesh.objects["body"].sum() == 3
+
+
+def area(mesh):
+    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+
+
+# an L of three squares; its corners in turn are also those of a fan that folds over
+L = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [1, 2, 0], [0, 2, 0]])
+
+
+@pytest.mark.parametrize("first", range(6))
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply"])
+def test_concave_polygons_are_cut_without_folds(first, suffix, tmp_path):
+    corners = [(first + k) % 6 for k in range(6)]
+    rows = "\n".join(" ".join(map(str, row)) for row in L)
+    text = {
+        ".obj": "\n".join(f"v {row}" for row in rows.splitlines()) + "\nf " + " ".join(str(c + 1) for c in corners),
+        ".off": f"OFF\n6 1 0\n{rows}\n6 " + " ".join(map(str, corners)),
+        ".ply": "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face 1\nproperty list uchar int vertex_index\nend_header\n{rows}\n6 " + " ".join(map(str, corners)),
+    }[suffix]
+    (tmp_path / f"a{suffix}").write_text(text)
+    mesh = mesh_file.read(tmp_path / f"a{suffix}")
+    assert len(mesh.faces) == 4
+    np.testing.assert_allclose(area(mesh), 3.0, rtol=1e-12)
+
+
+def test_triangles_of_any_polygon_cover_it_once():
+    """Stars of random radii, turned in space, some corners on the line between others."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        count = int(rng.integers(4, 12))
+        angle = np.sort(rng.uniform(0, 2 * np.pi, count))
+        if np.diff(angle, append=angle[0] + 2 * np.pi).max() > 3.0:
+            continue  # the middle is outside
+        flat = rng.uniform(0.3, 1.0, (count, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        middle = (flat + np.roll(flat, -1, axis=0)) / 2
+        flat = np.stack([flat, middle], axis=1).reshape(-1, 2) if rng.random() < 0.3 else flat
+        x, y = flat.T
+        true = 0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        points = np.pad(flat, ((0, 0), (0, 1))) @ turn.T
+        faces = polygon_file.triangles(points, [list(range(len(points)))])
+        assert len(faces) == len(points) - 2
+        a, b, c = points[faces].swapaxes(0, 1)
+        sizes = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        np.testing.assert_allclose(sizes.sum(), true, rtol=1e-9)
+
+
+def test_a_text_that_is_cut_short_is_refused(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(header + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    with pytest.raises(ValueError, match=r"a\.ply: .*cut short: face 1 of 2"):
+        mesh_file.read(tmp_path / "a.ply")
+    (tmp_path / "a.off").write_text("OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    with pytest.raises(ValueError, match=r"a\.off: .*cut short: 4 lines for 3 vertices and 2 faces"):
+        mesh_file.read(tmp_path / "a.off")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_polygons_of_any_size_and_type(order, tmp_path):
+    kind = "little" if order == "<" else "big"
+    header = f"ply\nformat binary_{kind}_endian 1.0\nelement vertex 5\nproperty double x\nproperty double y\n"
+    header += "property double z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nelement edge 1\n"
+    header += "property int vertex1\nproperty int vertex2\nelement face 2\nproperty list ushort ushort vertex_index\n"
+    header += "property uchar flags\nend_header\n"
+    rows = np.zeros(5, np.dtype([("at", f"{order}f8", 3), ("colour", "u1", 3)]))
+    rows["at"] = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0]]
+    rows["colour"] = [[200, 10, 10]] + 4 * [[10, 10, 10]]
+    body = rows.tobytes() + np.array([0, 1], f"{order}i4").tobytes()
+    for corners in ([0, 1, 2, 3], [1, 4, 2]):
+        body += np.array([len(corners), *corners], f"{order}u2").tobytes() + b"\7"
+    (tmp_path / "a.ply").write_bytes(header.encode() + body)
+    mesh = mesh_file.read(tmp_path / "a.ply")
+    assert len(mesh.faces) == 3 and area(mesh) == pytest.approx(1.5)
+    assert mesh.vertices[mesh.red].tolist() == [[0, 0, 0]]
+    (tmp_path / "a.ply").write_bytes(header.encode() + body[:-3])
+    with pytest.raises(ValueError, match=r"cut short: face 1 of 2"):
+        mesh_file.read(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-8-sig"])
+def test_an_obj_file_as_programs_write_it(encoding, tmp_path):
+    """Tabs, indents, colours of some vertices, faces in two groups, a line that goes on, vertices without a face."""
+    text = "v\t0 0 0 200 10 10\n  v 1 0 0\nv 1 1 0\nv 0 1 0\nv 9 9 9\ng waist skirt\n\tf 1/1 2/1 \\\n 3/1\nf 1 3 4\n"
+    (tmp_path / "a.obj").write_text(text, encoding=encoding)
+    mesh = mesh_file.read(tmp_path / "a.obj")
+    assert len(mesh.vertices) == 4 and area(mesh) == pytest.approx(1.0)
+    assert mesh.objects["waist"].all() and mesh.objects["skirt"].all()
+    assert mesh.vertices[mesh.red].tolist() == [[0, 0, 0]]
+
+
+@pytest.mark.parametrize("line, told", [
+    ("f 0 1 2", "line 4: a face names vertex 0, but OBJ counts from 1"),
+    ("v 0,5 0 0", "line 4: '0,5 0 0' should be numbers with a point in place of the comma"),
+    ("f 1 2 x", "line 4: 'x' names no vertex"),
+    ("f 1 2 4", "a face names vertex 4 of 3"),
+    ("f -1 -2 -4", "a face names vertex 0 of 3"),
+    ("v 1 2", "line 4: a vertex of 2 numbers"),
+])  # fmt: skip
+def test_a_line_that_is_wrong_is_named(line, told, tmp_path):
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{line}\n")
+    with pytest.raises(ValueError, match=rf"a\.obj: .*{told}"):
+        mesh_file.read(tmp_path / "a.obj")
+
+
+def test_what_is_not_as_the_scene_shows_it_is_refused_or_told(tmp_path):
+    copies, absent, old, posed = File(), File(), File(), File()
+    copies.json["nodes"][1]["extensions"] = {gltf_file.COPIES: {}}
+    absent.json["scenes"][0]["nodes"] = []
+    old.json["asset"]["version"] = "1.0"
+    for file, told in (
+        (copies, "copies of one object"),
+        (absent, r"its objects \(skirt\) are not in its scene"),
+        (old, r"glTF of version 1\.0"),
+    ):
+        with pytest.raises(ValueError, match=rf"a\.glb: .*{told}"):
+            mesh_file.read(file.save(tmp_path / "a.glb"))
+    weights = np.array([[1.0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 1, 0, 0]], np.float32)
+    joints = np.tile(np.array([[0, 1, 0, 0]], np.uint8), (4, 1))
+    posed.primitive["attributes"] |= {"JOINTS_0": posed.add(joints), "WEIGHTS_0": posed.add(weights)}
+    posed.json["skins"] = [{"joints": [2, 3]}]
+    posed.json["nodes"][1]["skin"] = 0
+    turned = [0.0, 0.0, np.sin(np.radians(5.0)), np.cos(np.radians(5.0))]
+    posed.json["nodes"] += [{"rotation": turned, "children": [3]}, {}]
+    posed.json["scenes"][0]["nodes"] = [0, 2]
+    assert not mesh_file.read(posed.save(tmp_path / "a.glb")).notes  # as a whole
+    posed.json["nodes"][3]["rotation"] = turned
+    (note,) = mesh_file.read(posed.save(tmp_path / "a.glb")).notes
+    assert "10 degrees from the pose that it was bound in" in note
+    posed.primitive["attributes"]["WEIGHTS_0"] = posed.add(weights * np.array([[1], [1], [1], [0]], np.float32))
+    with pytest.raises(ValueError, match=r"a\.glb: .*1 vertices of skirt cloth follow no joint"):
+        mesh_file.read(posed.save(tmp_path / "a.glb"))
+
+
+def test_colours_of_gltf_are_linear(tmp_path):
+    file = File()
+    shown = np.array([[200, 10, 10], [180, 120, 120], [255, 90, 90], [120, 10, 10]]) / 255
+    file.primitive["attributes"]["COLOR_0"] = file.add((shown**2.2).astype(np.float32))
+    assert mesh_file.read(file.save(tmp_path / "a.glb")).red.tolist() == [True, False, True, False]

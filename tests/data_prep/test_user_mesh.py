@@ -341,7 +341,7 @@ def test_an_open_front_is_pinned_above_a_height(skirt, body, names, save):
 def test_where_it_is_worn_is_told(skirt, body):
     vertices, faces = skirt
     for shift, told in (
-        ((0, 0.04, 0), r"worn from 0\.\d\d to 1\.\d\d m above the soles$"),
+        ((0, 0.04, 0), r"worn from 0\.\d\d to 1\.\d\d m above the soles, at -0\.\d\d to 0\.\d\d m$"),
         ((0, 0, 0.6), "goes around no part of the body: is it worn elsewhere"),
         ((0, -0.9, 0), "reaches below the soles: is it worn elsewhere"),
     ):
@@ -423,3 +423,67 @@ def test_the_unit_alone_is_proposed_where_it_may_be_what_is_wrong(body, names, t
     trimesh.Trimesh(100 * (skirt.vertices - [0.2, 0, 0]), skirt.faces, process=False).export(tmp_path / "skirt.obj")
     with pytest.raises(ValueError, match=r"Is it meant to be --units cm --up y\?"):
         bring(tmp_path / "skirt.obj", body, names, Answers(pin="highest"))
+
+
+@pytest.mark.parametrize("name", ["tshirt_1000", "dress_1000", "skirt_1000"])
+@pytest.mark.parametrize("units, up", [("m", "y"), ("mm", "z")])
+def test_a_garment_of_a_body_that_stands_on_zero_is_asked_about(name, units, up, body, names, save):
+    made = storage.load_garment(name, body)
+    soles = np.asarray(body.vertices)[:, 1].min()
+    vertices = (np.asarray(made.vertices, np.float64) - [0, soles, 0]) @ placement.TO_Y_UP[up] / METRES[units]
+    path = save(vertices, made.faces)
+    with pytest.raises(ValueError, match=rf"--units {units} --up {up} --shift 0\.00 {soles:.2f} 0\.00\?"):
+        bring(path, body, names, Answers())
+    there, _ = bring(path, body, names, Answers(Placement(units, up, (0.0, float(soles), 0.0))))
+    assert nearest(there.vertices, made.vertices).max() < 1e-4
+
+
+def test_what_is_far_too_small_is_not_asked_for_the_flags_in_use(skirt, body, names, save):
+    vertices, faces = skirt
+    with pytest.raises(ValueError, match=r"0\.\d+ x 0\.\d+ x 0\.\d+ m, Y up: not around the body in any unit"):
+        bring(save(0.05 * vertices, faces), body, names, Answers())
+
+
+def test_the_body_in_the_object_of_the_garment_is_refused(skirt, body, names, save):
+    figure = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
+    both = np.concatenate([figure[0], skirt[0]]), np.concatenate([figure[1], skirt[1] + len(figure[0])])
+    for mesh in (figure, both):
+        with pytest.raises(ValueError, match=r"it holds the body itself.*delete it from the file"):
+            bring(save(*mesh), body, names, Answers())
+
+
+def test_panels_that_lie_flat_are_refused(skirt, body, names, save):
+    """As before they are sewn: in front of the body and behind it, or beside each other on a table."""
+    x, y = np.meshgrid(np.linspace(-0.25, 0.25, 20), np.linspace(-0.3, 0.1, 20), indexing="ij")
+    panel = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    at = np.arange(400).reshape(20, 20)
+    a, b, c, d = (at[i, j].reshape(-1) for i in (slice(-1), slice(1, None)) for j in (slice(-1), slice(1, None)))
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    for move in ([0, 0, 0.4], [0.6, 0, 0]):
+        both = np.concatenate([panel - np.multiply(0.5, move), panel + np.multiply(0.5, move)])
+        with pytest.raises(ValueError, match=r"skirt\.obj: 100 % of it lies in flat parts, as a sewing pattern"):
+            bring(save(both, np.concatenate([faces, faces + 400])), body, names, Answers())
+    with_patch = np.concatenate([skirt[0], 0.1 * panel + [0, 0, 0.25]])  # a label on a skirt
+    bring(save(with_patch, np.concatenate([skirt[1], faces + len(skirt[0])])), body, names, Answers(loose=False))
+
+
+def test_what_is_pinned_is_some_of_the_garment(skirt, body, names, tmp_path):
+    vertices, faces = skirt
+    scene = trimesh.Scene()
+    for name, which in (("skirt", vertices), ("spare", vertices * [1.2, 1, 1.2])):
+        shape = trimesh.Trimesh(which, faces, process=False)
+        scene.add_geometry(shape, node_name=name, geom_name=f"mesh_of_{name}")
+    scene.export(tmp_path / "two.glb")
+    for pin, some in (("object:spare", "none"), ("object:skirt", "all")):
+        with pytest.raises(ValueError, match=rf"two\.glb: --pin {pin} pins {some} of the garment's 1009 vertices"):
+            bring(tmp_path / "two.glb", body, names, Answers(pin=pin, objects=("skirt",)))
+    _, said = bring(tmp_path / "two.glb", body, names, Answers(pin="highest", allow=True, loose=False))
+    assert "1 of 2 parts have no pinned vertex: nothing but the body holds them" in said
+    _, said = bring(tmp_path / "two.glb", body, names, Answers(allow=True, loose=False))
+    assert not any("no pinned vertex" in line for line in said)
+
+
+@pytest.mark.parametrize("sew", ["-1", "nan", "51"])
+def test_a_seam_is_so_wide(sew, tmp_path, skirt, save):
+    with pytest.raises(ValueError, match=rf"--sew {sew}: 0 to 50 mm"):
+        garment.main(garment.Arguments(tmp_path / "a.h5", mesh=save(*skirt), sew=float(sew)))
