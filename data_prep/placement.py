@@ -27,6 +27,7 @@ FLAT, WELDED = 1e-3, 1e-4  # of a mesh's size: from its plane, of a part that is
 MOSTLY = 0.5  # of a mesh's area, that is flat in a pattern before it is draped
 BELOW = 0.02  # m, below the soles
 AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
+UPRIGHT = ("y", "z")  # axes that point up in programs
 SAMPLE = 500  # vertices that stand for all
 
 
@@ -59,7 +60,8 @@ def check_place(path: str | Path, vertices: np.ndarray, surface: Surface, place:
             turns = [(place.turn + turn) % 360 for turn in QUARTERS]
             places += [place._replace(units=units, up=up, turn=turn) for up in others for turn in turns]
     if place.shift == Placement().shift:  # many programs have the soles at zero
-        places += [it._replace(shift=soles) for it in places if it(sample)[:, 1].min() > -BELOW]
+        standing = [it for it in places if it.up in (place.up, *UPRIGHT) and it(sample)[:, 1].min() > -BELOW]
+        places += [it._replace(shift=soles) for it in standing]
     distance, depth = _fit(sample, surface, places)
     cost = np.where(distance < MAX_MEAN_DISTANCE, distance + INSIDE_PENALTY * depth, np.inf)
     large = 0.05 * height < METRES[place.units] * np.ptp(vertices, axis=0).max() < 1.5 * height
