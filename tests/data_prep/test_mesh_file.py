@@ -230,6 +230,14 @@ def test_triangles_of_any_polygon_cover_it_once():
         np.testing.assert_allclose(sizes.sum(), true, rtol=1e-9)
 
 
+@pytest.mark.parametrize("first", range(6))
+def test_no_triangle_is_a_line_where_corners_lie_on_a_side(first):
+    """Such a triangle would be left out, and its long side would have other ends than those of the faces beside it."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0], [1, 1, 0], [0, 1, 0]])
+    a, b, c = points[polygon_file.triangles(points, [[(first + k) % 6 for k in range(6)]])].swapaxes(0, 1)
+    assert (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0.5).all()
+
+
 def test_a_text_that_is_cut_short_is_refused(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
