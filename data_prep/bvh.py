@@ -67,18 +67,25 @@ def read_bvh(path: str | Path, tell: Callable[[str], object] = str, joints: Path
 
     values, column = np.array(rows), 0
     rotations = np.tile(np.eye(3), (frames, len(names), 1, 1))
-    places = np.tile(offsets, (frames, 1, 1))
+    places, turned = np.tile(offsets, (frames, 1, 1)), []
+    given = np.full((frames, len(names), 3), np.nan)  # by channels of position
     for j, own in enumerate(channels):
         axes = "".join(c[0] for c in own if c.endswith("rotation"))
         turning = [column + k for k, c in enumerate(own) if c.endswith("rotation")]
         if axes:
             rotations[:, j] = Rotation.from_euler(axes, values[:, turning], degrees=True).as_matrix()
-        moving = [(column + k, "XYZ".index(c[0])) for k, c in enumerate(own) if c.endswith("position")]
-        # some programs write the place on the parent, some what is added to it
-        added = j > 0 and not np.any(values[:, [k for k, _ in moving]])
-        for k, axis in [] if added else moving:
-            places[:, j, axis] = values[:, k]
+            turned += turning
+        for k, channel in enumerate(own):
+            if channel.endswith("position"):
+                given[:, j, "XYZ".index(channel[0])] = values[:, column + k]
         column += len(own)
+    if 0.1 < np.abs(values[:, turned]).max(initial=0.0) < 2 * np.pi:
+        tell("no angle is over 6.28: are they in radians? BVH has degrees, so write them anew if they are")
+    # some programs write the place on the parent, some what is added to it, which is nearer to zero than to the offset
+    usual, own = np.median(given[:, 1:], axis=0), offsets[1:]
+    added = np.nansum(usual * own) < 0.5 * np.sum(own**2, where=np.isfinite(usual))
+    given[:, 1:] += own if added else 0.0
+    places = np.where(np.isfinite(given), given, places)
     plain = cmu_names(tuple(name.rpartition(":")[2] for name in names))  # Mixamo writes mixamorig:Hips
     above = np.array(parents)
     hips = [parts.hips for parts in skeleton.figures(plain, above, joints)]
