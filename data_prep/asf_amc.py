@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.recording import Capture, numbers, read_lines
+from data_prep.recording import FASTEST, SLOWEST, Capture, numbers, read_lines
 
 CMU_NAMES = {
     "root": "Hips",
@@ -97,7 +97,9 @@ def read_asf(path: str | Path) -> Skeleton:
                 if child not in bones or (key != "root" and key not in parents):
                     raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone defined before")
                 parents[child] = words[0]
-    if not bones or set(parents) != set(bones):
+    if not bones:
+        raise ValueError(f"{path}, line {line}: no bones: cut short, or no ASF file, which comes before the AMC file")
+    if set(parents) != set(bones):
         orphans = sorted(set(bones) - set(parents))
         raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {orphans}); cut short?")
     return Skeleton(bones, parents, degrees, order)
@@ -114,11 +116,17 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
     Raises:
         ValueError: naming file and line.
     """
+    if not SLOWEST <= fps <= FASTEST:
+        raise ValueError(f"{path}: --source-fps {fps:g}: give its frames a second, from {SLOWEST:g} to {FASTEST:g}")
     names = ["root", *skeleton.parents]
     width = {name: len(bone.freedoms) for name, bone in skeleton.bones.items() if bone.freedoms} | {"root": 6}
     values: dict[str, list[list[float]]] = {name: [] for name in width}
     frames = line = 0
     for line, words in read_lines(path):
+        if words[0].startswith(":") and words[0][1:4].lower() in ("rad", "deg"):
+            if (words[0][1:4].lower() == "deg") != skeleton.degrees:
+                unit = "degrees" if skeleton.degrees else "radians"
+                raise ValueError(f"{path}, line {line}: {words[0]}, but its skeleton is in {unit}: correct one of them")
         if words[0][0] in "#:":
             continue
         if len(words) == 1 and words[0].isdigit():

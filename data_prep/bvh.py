@@ -17,11 +17,10 @@ from scipy.spatial.transform import Rotation
 from clothjax.files.storage import load_rig
 from data_prep import skeleton
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.recording import Capture, numbers, read_lines
+from data_prep.recording import FASTEST, SLOWEST, Capture, numbers, read_lines
 from data_prep.rest_pose import figure
 from data_prep.skeleton import cmu_names
 
-SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of motion capture
 USUAL = (24.0, 25.0, 30.0, 50.0, 60.0, 72.0, 90.0, 100.0, 120.0, 200.0, 240.0)  # of which others may be rounded
 APART, JUMP = 3.0, 0.1  # of the farthest later jump, and of the longest bone: the jump after an added T-pose
 STRAIGHT, TURNED = 1 + 2 * np.cos(np.radians([0.1, 10.0]))  # traces of rotations by 0.1 and by 10 degrees

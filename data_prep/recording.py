@@ -11,6 +11,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 
+SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of a recording
+
+
 class Capture(NamedTuple):
     """A recorded motion of a skeleton in any unit of length."""
 
