@@ -199,6 +199,8 @@ class Arguments(SkeletonOptions):
 
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
+    if args.skip < 0:
+        raise ValueError(f"--skip {args.skip}: give how many frames are left out, 0 or more")
     rig = load_rig(args.body)
     capture = read_bvh(args.motion, lambda line: print(f"{args.motion}: {line}"), args.joints)
     if not args.skip and _begins_apart(capture):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import trimesh
-from samples import PARENTS, recording
+from samples import PARENTS, recording, smpl_regressor
 from scipy.spatial.transform import Rotation
 
 from clothjax.body import plausibility, skinning
@@ -25,9 +25,6 @@ def model():
     mesh = trimesh.creation.icosphere(subdivisions=3)
     vertices = np.asarray(mesh.vertices) * [0.5, 0.85, 0.2]
     count = len(vertices)
-    regressor = np.zeros((24, count))
-    for row in regressor:
-        row[rng.choice(count, 5, replace=False)] = 0.2
     weights = np.zeros((count, 24))
     weights[np.arange(count)[:, None], rng.integers(0, 24, (count, 4))] = 1.0
     table = np.array([PARENTS, range(24)])
@@ -38,7 +35,7 @@ def model():
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "shapedirs": 0.01 * rng.normal(size=(count, 3, 12)),
         "posedirs": 0.01 * rng.normal(size=(count, 3, 207)),
-        "J_regressor": scipy.sparse.csc_matrix(regressor),
+        "J_regressor": smpl_regressor(vertices),
         "kintree_table": table,
         "bs_type": "lrotmin",
     }
