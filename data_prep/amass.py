@@ -93,7 +93,9 @@ def read_amass(
         if len(wrong):
             raise ValueError(f"{path}: {name} of frame {wrong[0]} is not finite: cut it out")
     if len(rates) != 1:
-        raise ValueError(f"{path}: {', '.join(rated)} has {len(rates)} rates, as {rates[:3].tolist()}: leave the right one")
+        raise ValueError(
+            f"{path}: {', '.join(rated)} has {len(rates)} rates, as {rates[:3].tolist()}: leave the right one"
+        )
     (fps,) = rates.tolist()
     if not SLOWEST <= fps <= FASTEST:
         raise ValueError(

@@ -58,9 +58,7 @@ def read_gltf(
         return _capture(document, scene, number, fps, nodes, named, parents)
 
 
-def _root(
-    document: Document, scene: dict, number: int, joints: Path | None, tell: Callable[[str], object]
-) -> int:
+def _root(document: Document, scene: dict, number: int, joints: Path | None, tell: Callable[[str], object]) -> int:
     """Return the node of the hips of the first figure that an animation turns, or if none is known of the largest."""
     channels = document.entries("animations")[number]["channels"]
     turned = [c["target"].get("node") for c in channels if c["target"]["path"] == "rotation"]
@@ -74,7 +72,9 @@ def _root(
     hips = [node for node in hips if node in carried]
     for other in hips[1:]:
         first, second = (document.entries("nodes")[document.above(node)[-1]].get("name") for node in (hips[0], other))
-        tell(f"there are two figures: that of node {hips[0]} in {first} is taken, that of node {other} in {second} is not")
+        tell(
+            f"there are two figures: that of node {hips[0]} in {first} is taken, that of node {other} in {second} is not"
+        )
     highest = [node for node in turned if not set(document.above(node)[1:]) & set(turned)]
     hanging = Counter(above for node in nodes for above in document.above(node))
     return hips[0] if hips else max(highest, key=lambda node: hanging[node])
@@ -132,9 +132,7 @@ class Arguments(SkeletonOptions):
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
     rig = load_rig(args.body)
-    capture = read_gltf(
-        args.file, args.fps, args.animation, args.joints, lambda line: print(f"{args.file}: {line}")
-    )
+    capture = read_gltf(args.file, args.fps, args.animation, args.joints, lambda line: print(f"{args.file}: {line}"))
     motion = retarget_as_asked(capture, rig, args, args.file)
     write_motion(args.output, motion, rig, args.file, args)
 

@@ -74,7 +74,9 @@ def retarget(
             recording; if the recording is shorter than two frames.
     """
     if len(capture.translation) < 2:
-        raise ValueError(f"{about}: a motion has two frames at least, not {len(capture.translation)}: take a longer one")
+        raise ValueError(
+            f"{about}: a motion has two frames at least, not {len(capture.translation)}: take a longer one"
+        )
     capture = resample(capture, fps)
     names = cmu_names(names)
     of_body = skeleton.find(names, body.parents, "the body")

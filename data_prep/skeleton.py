@@ -266,12 +266,16 @@ def _whole(names: tuple[str, ...], parents: np.ndarray, limbs: dict, central: di
         )
     carriers = [ancestors(limbs[f"{side} upper arm"], parents)[1:] for side in SIDES if f"{side} upper arm" in limbs]
     carriers += [ancestors(head, parents)[1:]] if len(carriers) < 2 and head is not None else []
-    chest = next((joint for joint in carriers[0] if all(joint in other for other in carriers)), None) if carriers else None
+    chest = (
+        next((joint for joint in carriers[0] if all(joint in other for other in carriers)), None) if carriers else None
+    )
     spine = [] if chest is None else ancestors(chest, parents)
     left, right = (ancestors(limbs[f"{side} thigh"], parents)[1:] for side in SIDES)
     shared = [joint for joint in left if joint in right and (joint in spine or chest is None)]
     if not shared:
-        raise ValueError(f"{about}: its legs and its chest do not hang on one joint: export it with the joint that does")
+        raise ValueError(
+            f"{about}: its legs and its chest do not hang on one joint: export it with the joint that does"
+        )
     hips = central.get(("", "hips"))
     hips = hips if hips in shared else shared[0]
     spine = spine[: spine.index(hips)] if spine else []

@@ -43,7 +43,7 @@ KEYS = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table
 
 
 LEFT = tuple(f"left_{part}" for part in ("hip", "knee", "ankle", "collar", "shoulder", "elbow", "wrist"))
-TALL = (0.3, 3.0)  # m
+TALL, OUTSIDE = (0.3, 3.0), 0.1  # m; share of that, by which a joint may be outside of its mesh
 
 
 class _Placeholder:
@@ -227,6 +227,7 @@ def misplaced(body: Body) -> str:
     at = dict(zip(BODY, joints, strict=False))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     tall = high[1] - low[1]
+    low, high = low - OUTSIDE * tall, high + OUTSIDE * tall
     trunk = at["head"] - at["pelvis"]
     if np.abs(trunk).argmax() != 1 or trunk[1] < 0:
         return "its head is not above its pelvis along +y: turn v_template and shapedirs"
