@@ -70,6 +70,41 @@ def read_amass(
         ValueError: naming the file, the array and the first wrong entry; for a path that is not in `units`; for what
             `allow` would take.
     """
+    poses, trans, fps = _arrays(path)
+    rotations = _matrices(poses, path)
+    crooked = [] if allow else _crooked(rotations)
+    if crooked:
+        raise ValueError(
+            f"{path}: poses {poses.shape} are no rotations of a known kind: as they are, {', '.join(crooked)} would be "
+            "turned as no body is; convert them to axis-angle of joints on their parents, --allow takes it all the same"
+        )
+    trans = trans * METRES[units]
+    wrong = [part for part, one_way in _bends(rotations).items() if one_way < -ONE_WAY]
+    if wrong and not allow:
+        raise ValueError(
+            f"{path}: {' and '.join(wrong)} bend the wrong way: left and right are exchanged, or an axis is negated; "
+            "convert it again, --allow takes it all the same"
+        )
+    stands = rotations[:, 0, :, 1].mean(axis=0)  # SMPL's pelvis has +y up
+    seen = max(AXES, key=lambda axis: float(stands @ AXES[axis]))
+    seen = seen if stands @ AXES[seen] > UPRIGHT else None
+    if up is not None and seen not in (None, up) and not allow:
+        raise ValueError(f"{path}: --up {up}, but its figure stands along {seen}; --allow takes it all the same")
+    if up is None and seen not in (None, "z"):
+        tell(f"{seen} is up, for the figure stands along it; --up says otherwise")
+    up = up or seen or "z"
+    speed = np.linalg.norm(np.diff(trans, axis=0), axis=1).max(initial=0.0) * fps
+    height = abs(float(np.median(trans @ AXES[up])))
+    if units == "m" and (speed > doubts.FASTEST or height > HIGHEST):
+        found = f"up to {speed:.0f} m/s, {height:.0f} m high"
+        raise ValueError(f"{path}: trans looks like centimetres ({found}): give --units cm, or mm, or cut jumps out")
+    turn = turn_upright(AXES[up])
+    rotations[:, 0], trans = turn @ rotations[:, 0], trans @ turn.T
+    return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, fps)
+
+
+def _arrays(path: str | Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return poses [T, ...], path [T, 3] and rate of a file, finite and of two frames at least."""
     try:
         if not zipfile.is_zipfile(Path(path).resolve(strict=True)):
             raise ValueError("an .npz file of poses, trans and mocap_framerate is expected: convert it")
@@ -101,36 +136,7 @@ def read_amass(
         raise ValueError(
             f"{path}: {', '.join(rated)} is {fps:g}, not a rate in Hz: {SLOWEST:g} to {FASTEST:g} are expected"
         )
-    rotations = _matrices(poses, path)
-    crooked = [] if allow else _crooked(rotations)
-    if crooked:
-        raise ValueError(
-            f"{path}: poses {poses.shape} are no rotations of a known kind: as they are, {', '.join(crooked)} would be "
-            "turned as no body is; convert them to axis-angle of joints on their parents, --allow takes it all the same"
-        )
-    trans = trans * METRES[units]
-    wrong = [part for part, one_way in _bends(rotations).items() if one_way < -ONE_WAY]
-    if wrong and not allow:
-        raise ValueError(
-            f"{path}: {' and '.join(wrong)} bend the wrong way: left and right are exchanged, or an axis is negated; "
-            "convert it again, --allow takes it all the same"
-        )
-    stands = rotations[:, 0, :, 1].mean(axis=0)  # SMPL's pelvis has +y up
-    seen = max(AXES, key=lambda axis: float(stands @ AXES[axis]))
-    seen = seen if stands @ AXES[seen] > UPRIGHT else None
-    if up is not None and seen not in (None, up) and not allow:
-        raise ValueError(f"{path}: --up {up}, but its figure stands along {seen}; --allow takes it all the same")
-    if up is None and seen not in (None, "z"):
-        tell(f"{seen} is up, for the figure stands along it; --up says otherwise")
-    up = up or seen or "z"
-    speed = np.linalg.norm(np.diff(trans, axis=0), axis=1).max(initial=0.0) * fps
-    height = abs(float(np.median(trans @ AXES[up])))
-    if units == "m" and (speed > doubts.FASTEST or height > HIGHEST):
-        found = f"up to {speed:.0f} m/s, {height:.0f} m high"
-        raise ValueError(f"{path}: trans looks like centimetres ({found}): give --units cm, or mm, or cut jumps out")
-    turn = turn_upright(AXES[up])
-    rotations[:, 0], trans = turn @ rotations[:, 0], trans @ turn.T
-    return Capture(cmu_names(BODY), np.full(len(BODY), -1), np.zeros((len(BODY), 3)), rotations, trans, fps)
+    return poses, trans, fps
 
 
 def _matrices(poses: np.ndarray, path: str | Path) -> np.ndarray:

@@ -97,11 +97,9 @@ def read_asf(path: str | Path) -> Skeleton:
                 if child not in bones or (key != "root" and key not in parents):
                     raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone defined before")
                 parents[child] = words[0]
-    if not bones:
-        raise ValueError(f"{path}, line {line}: no bones: cut short, or no ASF file, which comes before the AMC file")
-    if set(parents) != set(bones):
-        orphans = sorted(set(bones) - set(parents))
-        raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {orphans}); cut short?")
+    if not bones or set(parents) != set(bones):
+        orphans = f"bones without parent: {sorted(set(bones) - set(parents))}" if bones else "no bones: no ASF file"
+        raise ValueError(f"{path}, line {line}: no complete :hierarchy ({orphans}); cut short, or AMC before ASF?")
     return Skeleton(bones, parents, degrees, order)
 
 
@@ -123,10 +121,9 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
     values: dict[str, list[list[float]]] = {name: [] for name in width}
     frames = line = 0
     for line, words in read_lines(path):
-        if words[0].startswith(":") and words[0][1:4].lower() in ("rad", "deg"):
-            if (words[0][1:4].lower() == "deg") != skeleton.degrees:
-                unit = "degrees" if skeleton.degrees else "radians"
-                raise ValueError(f"{path}, line {line}: {words[0]}, but its skeleton is in {unit}: correct one of them")
+        if words[0][:4].lower() == (":rad" if skeleton.degrees else ":deg"):
+            unit = "degrees" if skeleton.degrees else "radians"
+            raise ValueError(f"{path}, line {line}: {words[0]}, but its skeleton is in {unit}: correct one of them")
         if words[0][0] in "#:":
             continue
         if len(words) == 1 and words[0].isdigit():

@@ -195,7 +195,7 @@ def _skeleton(
 ) -> tuple[tuple[str, ...], np.ndarray, skeleton.Parts, list[str]]:
     """Return names and parents [n] of nodes, the parts of the body among them, and which are called otherwise."""
     parents = np.array([nodes.index(above) if (above := document.parent(node)) in nodes else -1 for node in nodes])
-    names = distinct_names([document.entries("nodes")[node].get("name") or f"node {node}" for node in nodes])
+    names = distinct_names([document.name(node) for node in nodes])
     said = {part: names[nodes.index(node)] for part, node in humanoid(document).items() if node in nodes}
     if said and joints is None:
         of_body = skeleton.told(said, names, parents, "its VRM humanoid")

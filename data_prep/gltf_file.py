@@ -205,6 +205,10 @@ class Document:
             found[node] = matrices if parent is None else found[parent] @ matrices
         return found
 
+    def name(self, node: int) -> str:
+        """Return what a node is called."""
+        return self.entries("nodes")[node].get("name") or f"node {node}"
+
     def above(self, node: int) -> list[int]:
         """Return a node and those that it hangs on, up to the scene."""
         chain = [node]
@@ -224,7 +228,7 @@ class Document:
 def _check_keys(document: Document, moves: dict[tuple[int, str], tuple]) -> None:
     """Refuse keys of an animation that are not in order, not in seconds, or no rotations."""
     for (node, kind), (keys, values, _) in moves.items():
-        name = document.entries("nodes")[node].get("name", f"node {node}")
+        name = document.name(node)
         if not (np.isfinite(keys).all() and np.isfinite(values).all()):
             raise ValueError(f"the {kind} of {name} has a key that is not finite: export it again")
         late = np.flatnonzero(np.diff(keys) <= 0)
@@ -237,7 +241,7 @@ def _check_keys(document: Document, moves: dict[tuple[int, str], tuple]) -> None
     apart = np.diff(keys)
     if len(keys) >= SAMPLED and apart.min() > max(1 / SLOWEST, 0.9 * apart.max()):
         raise ValueError(
-            f"its {len(keys)} keys are {apart[0]:.3g} s apart: are its times in seconds? Export it at 30 frames a second"
+            f"its {len(keys)} keys are {apart[0]:.3g} s apart: are its times in seconds? Export it at 30 a second"
         )
 
 

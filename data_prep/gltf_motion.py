@@ -52,10 +52,8 @@ def read_gltf(
             raise ValueError("it has no animation")
         if animation not in (None, *names) or (animation is None and len(names) > 1):
             raise ValueError(f"which of its animations (--animation)? There are {', '.join(names)}")
-        number = 0 if animation is None else names.index(animation)
-        scene = document.places()
-        nodes, named, parents = _hanging_on(document, scene, _root(document, scene, number, joints, tell))
-        return _capture(document, scene, number, fps, nodes, named, parents)
+        number, scene = 0 if animation is None else names.index(animation), document.places()
+        return _capture(document, scene, number, fps, _root(document, scene, number, joints, tell))
 
 
 def _root(document: Document, scene: dict, number: int, joints: Path | None, tell: Callable[[str], object]) -> int:
@@ -71,25 +69,16 @@ def _root(document: Document, scene: dict, number: int, joints: Path | None, tel
     hips = [nodes[parts.hips] for parts in skeleton.figures(names, parents, joints)]
     hips = [node for node in hips if node in carried]
     for other in hips[1:]:
-        first, second = (document.entries("nodes")[document.above(node)[-1]].get("name") for node in (hips[0], other))
-        tell(
-            f"there are two figures: that of node {hips[0]} in {first} is taken, that of node {other} in {second} is not"
-        )
+        taken, left = (f"node {node} in {document.name(document.above(node)[-1])}" for node in (hips[0], other))
+        tell(f"there are two figures: that of {taken} is taken, that of {left} is left out")
     highest = [node for node in turned if not set(document.above(node)[1:]) & set(turned)]
     hanging = Counter(above for node in nodes for above in document.above(node))
     return hips[0] if hips else max(highest, key=lambda node: hanging[node])
 
 
-def _capture(
-    document: Document,
-    scene: dict,
-    number: int,
-    fps: float,
-    nodes: list[int],
-    names: tuple[str, ...],
-    parents: np.ndarray,
-) -> Capture:
-    """Return how an animation moves the nodes of a figure."""
+def _capture(document: Document, scene: dict, number: int, fps: float, root: int) -> Capture:
+    """Return how an animation moves the nodes that hang on one."""
+    nodes, names, parents = _hanging_on(document, scene, root)
     moved = document.moved(number, fps, {*nodes, *document.above(nodes[0])})
     world = np.stack([moved[node] for node in nodes], axis=1)
     skin = next((k for k, each in enumerate(document.entries("skins")) if nodes[0] in each["joints"]), None)
@@ -111,8 +100,7 @@ def _hanging_on(document: Document, scene: dict, root: int) -> tuple[list[int], 
 def _named(document: Document, nodes: list[int]) -> tuple[tuple[str, ...], np.ndarray]:
     """Return the names of nodes, CMU's for parts of a humanoid, and which of them each hangs on, -1 for none."""
     called = {node: skeleton.cmu_name(part) for part, node in humanoid(document).items()}
-    names = [document.entries("nodes")[node].get("name") or f"node {node}" for node in nodes]
-    names = cmu_names(tuple(name.rpartition(":")[2] for name in names))
+    names = cmu_names(tuple(document.name(node).rpartition(":")[2] for node in nodes))
     if called:  # another may be called as a part
         names = tuple(called.get(node, f"{name} of the file") for node, name in zip(nodes, names, strict=True))
     number = {node: j for j, node in enumerate(nodes)}

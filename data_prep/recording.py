@@ -10,7 +10,6 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-
 SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of a recording
 
 

@@ -102,8 +102,8 @@ def retarget(
         if rest is None:
             if not allow and any(end.endswith(" hand") for end in _absent_ends(of_file)):
                 raise ValueError(
-                    f"{about}: it has no hands, and its rest pose is no T-pose, so its forearms are not seen: export it "
-                    "with hands or in a T-pose; --allow takes it all the same"
+                    f"{about}: it has no hands, and its rest pose is no T-pose, so its forearms are not seen: export "
+                    "it with hands or in a T-pose; --allow takes it all the same"
                 )
             frame = rest_pose.straightest(shown, of_file)
             reference = rest_pose.standing(shown, resting, capture.parents, of_file, frame)
@@ -159,8 +159,8 @@ def _refuse_lost_bones(capture: Capture, shown: Figure, parts: Parts, about: str
     for start, end in ends:
         if not shown.bone(start, end)[0].any():
             raise ValueError(
-                f"{about}: {capture.names[start]} and {capture.names[end]} are at one place: export it with the offsets "
-                "of its joints"
+                f"{about}: {capture.names[start]} and {capture.names[end]} are at one place: export it with the "
+                "offsets of its joints"
             )
 
 

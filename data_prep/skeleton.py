@@ -1,8 +1,8 @@
 """Which joint of a skeleton is which part of a body: by whole naming schemes, and by who hangs on whom.
 
 Known are the names of CMU, Mixamo, LaFAN1, Rokoko, Xsens, 100STYLE, Bandai-Namco, SMPL, Daz, Unreal and MetaHuman, VRM,
-Rigify, 3ds Max Biped and Cats, with any prefix that all joints share. Arms and legs may follow two schemes. For other names
-there is a mapping file (`mapped`).
+Rigify, 3ds Max Biped and Cats, with any prefix that all joints share. Arms and legs may follow two schemes. For other
+names there is a mapping file (`mapped`).
 """
 
 import re
