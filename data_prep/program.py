@@ -74,7 +74,7 @@ class SkeletonOptions(MotionOptions):
     """Take where the joints are, not how they are turned, which some programs choose as they like. Hands and toes stay
     on their limbs."""
     allow: bool = False
-    """Take a recording without arms or head, and a result that differs from the recording."""
+    """Take a recording without arms, hands or head, and a result that differs from the recording."""
     abduct: float = 0.0
     """Degrees the upper arms are taken outward; 25 for CMU's recordings (see data_prep.asf_amc)."""
     drop_clavicles: float = 0.0
