@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.recording import Capture, numbers, read_lines
+from data_prep.recording import FASTEST, SLOWEST, Capture, numbers, read_lines
 
 CMU_NAMES = {
     "root": "Hips",
@@ -98,8 +98,8 @@ def read_asf(path: str | Path) -> Skeleton:
                     raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone defined before")
                 parents[child] = words[0]
     if not bones or set(parents) != set(bones):
-        orphans = sorted(set(bones) - set(parents))
-        raise ValueError(f"{path}, line {line}: no complete :hierarchy (bones without parent: {orphans}); cut short?")
+        orphans = f"bones without parent: {sorted(set(bones) - set(parents))}" if bones else "no bones: no ASF file"
+        raise ValueError(f"{path}, line {line}: no complete :hierarchy ({orphans}); cut short, or AMC before ASF?")
     return Skeleton(bones, parents, degrees, order)
 
 
@@ -114,11 +114,16 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
     Raises:
         ValueError: naming file and line.
     """
+    if not SLOWEST <= fps <= FASTEST:
+        raise ValueError(f"{path}: --source-fps {fps:g}: give its frames a second, from {SLOWEST:g} to {FASTEST:g}")
     names = ["root", *skeleton.parents]
     width = {name: len(bone.freedoms) for name, bone in skeleton.bones.items() if bone.freedoms} | {"root": 6}
     values: dict[str, list[list[float]]] = {name: [] for name in width}
     frames = line = 0
     for line, words in read_lines(path):
+        if words[0][:4].lower() == (":rad" if skeleton.degrees else ":deg"):
+            unit = "degrees" if skeleton.degrees else "radians"
+            raise ValueError(f"{path}, line {line}: {words[0]}, but its skeleton is in {unit}: correct one of them")
         if words[0][0] in "#:":
             continue
         if len(words) == 1 and words[0].isdigit():

@@ -15,24 +15,24 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
+from data_prep import skeleton
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.recording import Capture, numbers, read_lines
+from data_prep.recording import FASTEST, SLOWEST, Capture, numbers, read_lines
 from data_prep.rest_pose import figure
 from data_prep.skeleton import cmu_names
 
-SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of motion capture
 USUAL = (24.0, 25.0, 30.0, 50.0, 60.0, 72.0, 90.0, 100.0, 120.0, 200.0, 240.0)  # of which others may be rounded
 APART, JUMP = 3.0, 0.1  # of the farthest later jump, and of the longest bone: the jump after an added T-pose
 STRAIGHT, TURNED = 1 + 2 * np.cos(np.radians([0.1, 10.0]))  # traces of rotations by 0.1 and by 10 degrees
-STILL = 1e-3  # of the longest bone, by which a joint that does not move on its parent may move
 
 
-def read_bvh(path: str | Path, tell: Callable[[str], object] = str) -> Capture:
-    """Read the recording in a BVH file.
+def read_bvh(path: str | Path, tell: Callable[[str], object] = str, joints: Path | None = None) -> Capture:
+    """Read the recording of the figure in a BVH file; what its hips hang on carries it.
 
     Args:
         path: of the file.
-        tell: called with a line if its Frame Time has too few digits to be what it says.
+        tell: called with a line about each thing that is hardly meant: its Frame Time, angles, a second figure.
+        joints: a mapping file, as of `skeleton.mapped`, for names that are not known.
 
     Raises:
         ValueError: naming file and line.
@@ -66,20 +66,31 @@ def read_bvh(path: str | Path, tell: Callable[[str], object] = str) -> Capture:
 
     values, column = np.array(rows), 0
     rotations = np.tile(np.eye(3), (frames, len(names), 1, 1))
-    places = np.tile(offsets, (frames, 1, 1))
+    places, turned = np.tile(offsets, (frames, 1, 1)), []
+    given = np.full((frames, len(names), 3), np.nan)  # by channels of position
     for j, own in enumerate(channels):
         axes = "".join(c[0] for c in own if c.endswith("rotation"))
         turning = [column + k for k, c in enumerate(own) if c.endswith("rotation")]
         if axes:
             rotations[:, j] = Rotation.from_euler(axes, values[:, turning], degrees=True).as_matrix()
-        moving = [(column + k, "XYZ".index(c[0])) for k, c in enumerate(own) if c.endswith("position")]
-        # some programs write the place on the parent, some what is added to it
-        added = j > 0 and not np.any(values[:, [k for k, _ in moving]])
-        for k, axis in [] if added else moving:
-            places[:, j, axis] = values[:, k]
+            turned += turning
+        for k, channel in enumerate(own):
+            if channel.endswith("position"):
+                given[:, j, "XYZ".index(channel[0])] = values[:, column + k]
         column += len(own)
+    if 0.1 < np.abs(values[:, turned]).max(initial=0.0) < 2 * np.pi:
+        tell("no angle is over 6.28: are they in radians? BVH has degrees, so write them anew if they are")
+    # some programs write the place on the parent, some what is added to it, which is nearer to zero than to the offset
+    usual, own = np.median(given[:, 1:], axis=0), offsets[1:]
+    added = np.nansum(usual * own) < 0.5 * np.sum(own**2, where=np.isfinite(usual))
+    given[:, 1:] += own if added else 0.0
+    places = np.where(np.isfinite(given), given, places)
     plain = cmu_names(tuple(name.rpartition(":")[2] for name in names))  # Mixamo writes mixamorig:Hips
-    return _below_the_path(plain, parents, places, rotations, fps)
+    above = np.array(parents)
+    hips = [parts.hips for parts in skeleton.figures(plain, above, joints)]
+    for other in hips[1:]:
+        tell(f"there are two figures: that of {names[hips[0]]} is taken, that of {names[other]} is left out")
+    return _hanging_on(hips[0] if hips else 0, plain, above, places, rotations, fps)
 
 
 def _rate(text: str, duration: float) -> float:
@@ -89,27 +100,28 @@ def _rate(text: str, duration: float) -> float:
     return min(usual, key=lambda rate: abs(duration - 1 / rate), default=round(1 / duration, 2))
 
 
-def _below_the_path(
-    names: tuple[str, ...], parents: list[int], places: np.ndarray, rotations: np.ndarray, fps: float
+def _hanging_on(
+    root: int, names: tuple[str, ...], parents: np.ndarray, places: np.ndarray, rotations: np.ndarray, fps: float
 ) -> Capture:
-    """Return a recording whose root is the joint that moves: one above it, such as an armature, is left out.
+    """Return the recording of a joint and of all that hang on it; those above it, such as an armature, carry it.
 
     Args:
+        root: the joint.
         names: of the joints.
-        parents: of the joints.
+        parents: [n] of the joints.
         places: [T, n, 3] on their parents; of the root in the world.
         rotations: [T, n, 3, 3] local.
         fps: frames a second.
     """
-    offsets = np.median(places, axis=0)
-    longest = np.linalg.norm(offsets[1:], axis=1).max(initial=0.0)
-    while parents.count(0) == 1 and np.ptp(places[:, 1], axis=0).max() > STILL * longest:
-        path = places[:, 0] + np.einsum("tab,tb->ta", rotations[:, 0], places[:, 1])
-        rotations = np.concatenate([rotations[:, :1] @ rotations[:, 1:2], rotations[:, 2:]], axis=1)
-        places = np.concatenate([path[:, None], places[:, 2:]], axis=1)
-        names, offsets, parents = names[1:], offsets[1:], [-1, *(parent - 1 for parent in parents[2:])]
-    offsets[0] = 0.0  # the root has its path
-    return Capture(names, np.array(parents), offsets, rotations, places[:, 0], fps)
+    path, turn = places[:, root], rotations[:, root]
+    for joint in skeleton.ancestors(root, parents)[1:]:
+        path = places[:, joint] + np.einsum("tab,tb->ta", rotations[:, joint], path)
+        turn = rotations[:, joint] @ turn
+    kept = [j for j in range(len(names)) if root in skeleton.ancestors(j, parents)]
+    offsets, rotations = np.median(places[:, kept], axis=0), rotations[:, kept]
+    offsets[0], rotations[:, 0] = 0.0, turn  # the root has its path
+    above = np.array([-1, *(kept.index(parents[j]) for j in kept[1:])])
+    return Capture(tuple(names[j] for j in kept), above, offsets, rotations, path, fps)
 
 
 def _begins_apart(capture: Capture) -> bool:
@@ -187,7 +199,10 @@ class Arguments(SkeletonOptions):
 
 def main(args: Arguments) -> None:
     """Write the motion file, and print which frames are implausible."""
-    rig, capture = load_rig(args.body), read_bvh(args.motion, lambda line: print(f"{args.motion}: {line}"))
+    if args.skip < 0:
+        raise ValueError(f"--skip {args.skip}: give how many frames are left out, 0 or more")
+    rig = load_rig(args.body)
+    capture = read_bvh(args.motion, lambda line: print(f"{args.motion}: {line}"), args.joints)
     if not args.skip and _begins_apart(capture):
         print(f"{args.motion}: frame 0 is far from the next, as an added T-pose is: --skip 1 leaves it out")
     capture = capture._replace(rotations=capture.rotations[args.skip :], translation=capture.translation[args.skip :])

@@ -24,6 +24,7 @@ TALL = (1.0, 2.3)  # m, of a figure whose unit of length is looked for
 FARTHEST = 2.5  # m, of a vertex from the hips
 WELD = 1e-5  # m, within which vertices are one: files split them where textures and normals do
 MOST_FACES = 30_000  # of a body as it is; contact is sought on every one
+BENT = 1e-3  # of the height, by which a vertex may be elsewhere, as it was bound in another pose
 MOVED = 0.005  # m, by which a morph target moves the trunk or a limb at least to be a shape of the body
 FULL = 3.0  # betas at which a morph target is taken in full
 
@@ -141,11 +142,17 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
         )
     number = {nodes[j]: k for k, j in enumerate(below)}
 
-    vertices, faces, weights, moves, outside = [], [], [], [], 0
+    vertices, faces, weights, moves, outside, bent = [], [], [], [], 0, 0.0
     for part in chosen:
         assert part.skinned is not None
         skin, count = document.entries("skins")[part.skinned.skin], len(part.vertices)
         mesh_to_world = to_world(document, part.skinned.skin, nodes, places)
+        inverse = document.inverse_bind(part.skinned.skin)
+        carrying = np.tile(mesh_to_world, (len(skin["joints"]), 1, 1))
+        if inverse is not None:  # a part may have been bound in another pose than the largest one
+            carrying = places[[nodes.index(joint) for joint in skin["joints"]]] @ inverse
+        by_vertex = np.einsum("vk,vkab->vab", part.skinned.weights, carrying[part.skinned.joints])
+        by_vertex += (1.0 - part.skinned.weights.sum(axis=1))[:, None, None] * mesh_to_world
         columns = np.array([number.get(joint, 0) for joint in skin["joints"]])[part.skinned.joints]
         elsewhere = np.array([joint not in number for joint in skin["joints"]])[part.skinned.joints]
         outside += int(((part.skinned.weights * elsewhere).sum(axis=1) > 0.01).sum())
@@ -153,9 +160,14 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
         np.add.at(own, (np.arange(count)[:, None], columns), part.skinned.weights)
         own[own.sum(axis=1) == 0, 0] = 1.0
         faces.append(part.faces + sum(map(len, vertices)))
-        vertices.append(part.skinned.bound @ mesh_to_world[:3, :3].T + mesh_to_world[:3, 3])
+        turns, moved = by_vertex[:, :3, :3], by_vertex[:, :3, 3]
+        vertices.append(np.einsum("vab,vb->va", turns, part.skinned.bound) + moved)
+        plain = part.skinned.bound @ mesh_to_world[:3, :3].T + mesh_to_world[:3, 3]
+        bent = max(bent, float(np.linalg.norm(vertices[-1] - plain, axis=1).max(initial=0.0)))
         weights.append(own)
-        moves.append({name: added @ mesh_to_world[:3, :3].T for name, added in part.morphs.items()})
+        moves.append({name: np.einsum("vab,vb->va", turns, added) for name, added in part.morphs.items()})
+    if bent > BENT * np.ptp(np.concatenate(vertices), axis=0).max():
+        log.append("an object was bound in another pose than the largest one: it is carried into that pose")
     if outside:
         log.append(f"{outside} vertices follow joints that do not hang on the hips: they follow the hips")
     vertices, faces, weights = (np.concatenate(each) for each in (vertices, faces, weights))
@@ -183,7 +195,7 @@ def _skeleton(
 ) -> tuple[tuple[str, ...], np.ndarray, skeleton.Parts, list[str]]:
     """Return names and parents [n] of nodes, the parts of the body among them, and which are called otherwise."""
     parents = np.array([nodes.index(above) if (above := document.parent(node)) in nodes else -1 for node in nodes])
-    names = distinct_names([document.entries("nodes")[node].get("name") or f"node {node}" for node in nodes])
+    names = distinct_names([document.name(node) for node in nodes])
     said = {part: names[nodes.index(node)] for part, node in humanoid(document).items() if node in nodes}
     if said and joints is None:
         of_body = skeleton.told(said, names, parents, "its VRM humanoid")
@@ -216,7 +228,12 @@ def _upright(bound: Bound, of_body: skeleton.Parts, units: Unit | None) -> tuple
             raise ValueError(
                 f"its {side} foot points backwards: it is mirrored, or the names of left and right are exchanged"
             )
-    tall = np.ptp(bound.vertices @ up)
+    tall, own = np.ptp(bound.vertices @ up), at[[*of_body.chain, *limbs.values()]] @ up
+    if not 0.5 < np.ptp(own) / tall < 2.0 or not (bound.vertices @ up).min() < own.mean() < (bound.vertices @ up).max():
+        raise ValueError(
+            f"its joints, {np.ptp(own):.3g} units tall, are not in its mesh, {tall:.3g} tall: bind the mesh to the "
+            "skeleton again, and export the inverse bind matrices"
+        )
     scale = METRES[units] if units else next((x for x in METRES.values() if TALL[0] < x * tall < TALL[1]), 0.0)
     scale = 1.0 if not units and 0.3 < tall < 3.0 else scale
     if not 0.3 < scale * tall < 3.0:

@@ -41,7 +41,7 @@ def motions(character: Character, fps: float) -> tuple[dict[str, Motion], list[s
     for number, animation in enumerate(character.document.entries("animations")):
         name = re.sub(r"[^A-Za-z0-9._-]+", "_", animation.get("name") or f"animation_{number}").strip("_.")
         name = f"{name}_{number}" if name in found or not name else name
-        with naming(character.document.path):
+        with naming(f"{character.document.path}, animation {name}"):
             motion, told = _motion(character, number, fps)
         log += [f"animation {name}: {line}" for line in told]
         if motion is not None:

@@ -8,6 +8,7 @@ import json
 import urllib.parse
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from clothjax.files.damage import UNREADABLE
+from data_prep.recording import SLOWEST
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -24,6 +26,8 @@ COPIES = "EXT_mesh_gpu_instancing"
 GLB = b"glTF"
 TRIANGLES = 4  # the mode of a primitive; strips and fans follow
 MOST = 10_000_000  # entries of an accessor
+LATE = 1e-4  # s, by which a key may be late, as numbers of a file are rounded
+SAMPLED = 10  # keys at equal times, from which on they are the frames of a recording
 MOST_FRAMES = 200_000  # of an animation: two hours at 30 a second
 
 
@@ -76,6 +80,9 @@ class Document:
         if not data:
             raise ValueError("an empty file: copy or download it again")
         if data[:4] == GLB:
+            version = int.from_bytes(data[4:8], "little")
+            if version != 2:
+                raise ValueError(f"glTF of version {version}, not 2: export it as glTF 2.0")
             at, chunks = 12, []
             while at + 8 <= len(data):
                 size = int.from_bytes(data[at : at + 4], "little")
@@ -133,7 +140,10 @@ class Document:
             elif uri.startswith("data:"):
                 self._buffers[index] = base64.b64decode(uri.partition(",")[2])
             else:
-                self._buffers[index] = (self.path.parent / urllib.parse.unquote(uri)).read_bytes()
+                beside = self.path.parent / urllib.parse.unquote(uri)
+                if not beside.is_file():
+                    raise ValueError(f"its data are in {beside}, which is not there: copy that file, too")
+                self._buffers[index] = beside.read_bytes()
         return self._buffers[index]
 
     def places(self) -> dict[int, np.ndarray]:
@@ -189,6 +199,7 @@ class Document:
                 moves[node, kind] = keys, values, sampler.get("interpolation", "LINEAR")
         if not moves:
             return {}
+        _check_keys(self, moves)
         start, end = (f(f(keys) for keys, *_ in moves.values()) for f in (min, max))
         if not 0 <= (end - start) * fps <= MOST_FRAMES:
             raise ValueError(f"an animation of {end - start:.3g} s has more than {MOST_FRAMES} frames")
@@ -204,6 +215,10 @@ class Document:
             found[node] = matrices if parent is None else found[parent] @ matrices
         return found
 
+    def name(self, node: int) -> str:
+        """Return what a node is called."""
+        return self.entries("nodes")[node].get("name") or f"node {node}"
+
     def above(self, node: int) -> list[int]:
         """Return a node and those that it hangs on, up to the scene."""
         chain = [node]
@@ -213,7 +228,31 @@ class Document:
 
     def parent(self, node: int) -> int | None:
         """Return the node that carries another."""
-        return next((i for i, other in enumerate(self.entries("nodes")) if node in other.get("children", ())), None)
+        return self._parents.get(node)
+
+    @cached_property
+    def _parents(self) -> dict[int, int]:
+        return {child: i for i, node in enumerate(self.entries("nodes")) for child in node.get("children", ())}
+
+
+def _check_keys(document: Document, moves: dict[tuple[int, str], tuple]) -> None:
+    """Refuse keys of an animation that are not in order, not in seconds, or no rotations."""
+    for (node, kind), (keys, values, _) in moves.items():
+        name = document.name(node)
+        if not (np.isfinite(keys).all() and np.isfinite(values).all()):
+            raise ValueError(f"the {kind} of {name} has a key that is not finite: export it again")
+        late = np.flatnonzero(np.diff(keys) <= 0)
+        if len(late):
+            raise ValueError(f"the {kind} of {name}: key {late[0] + 1} is not after key {late[0]}: export it again")
+        still = np.flatnonzero(np.linalg.norm(values, axis=1) == 0.0) if kind == "rotation" else []
+        if len(still) and len(values) == len(keys):
+            raise ValueError(f"the rotation of {name} is no rotation at key {still[0]}: it is 0 0 0 0")
+    keys = max((keys for keys, *_ in moves.values()), key=len)
+    apart = np.diff(keys)
+    if len(keys) >= SAMPLED and apart.min() > max(1 / SLOWEST, 0.9 * apart.max()):
+        raise ValueError(
+            f"its {len(keys)} keys are {apart[0]:.3g} s apart: are its times in seconds? Export it at 30 a second"
+        )
 
 
 def _composed(moves: dict[str, np.ndarray], node: dict[str, Any], frames: int) -> np.ndarray:
@@ -245,7 +284,7 @@ def _sampled(times: np.ndarray, keys: np.ndarray, values: np.ndarray, how: str) 
         ends = (2 * s**3 - 3 * s**2 + 1) * middle[low] + (3 * s**2 - 2 * s**3) * middle[low + 1]
         slopes = (s**3 - 2 * s**2 + s) * after[low] + (s**3 - s**2) * before[low + 1]
         return ends + width[:, None] * slopes
-    low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 1)
+    low = np.clip(np.searchsorted(keys, times + LATE, side="right") - 1, 0, len(keys) - 1)
     if how == "STEP" or len(keys) == 1:
         return values[low]
     if values.shape[1] == 4:

@@ -1,5 +1,7 @@
 """The skeleton in a glTF file: what its joints are called, and where they are in the pose in which a mesh was bound."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +23,7 @@ def humanoid(document: Document) -> dict[str, int]:
     return {PART_OF_VRM[name]: node for name, node in bones.items() if name in PART_OF_VRM}
 
 
-def distinct_names(names: list[str]) -> tuple[str, ...]:
+def distinct_names(names: Sequence[str]) -> tuple[str, ...]:
     """Return names of which no two are the same."""
     return tuple(name if names.index(name) == k else f"{name} {k}" for k, name in enumerate(names))
 

@@ -54,6 +54,7 @@ class MotionOptions(OutputOptions):
     """Keep hands, fingers and toes still."""
 
 
+HIGHEST = 20.0  # m, of the hips in half of the frames, for a file that is read again
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -73,7 +74,7 @@ class SkeletonOptions(MotionOptions):
     """Take where the joints are, not how they are turned, which some programs choose as they like. Hands and toes stay
     on their limbs."""
     allow: bool = False
-    """Take a recording without arms or head, and a result that differs from the recording."""
+    """Take a recording without arms, hands or head, and a result that differs from the recording."""
     abduct: float = 0.0
     """Degrees the upper arms are taken outward; 25 for CMU's recordings (see data_prep.asf_amc)."""
     drop_clavicles: float = 0.0
@@ -101,7 +102,7 @@ def known_parts(
     except ValueError as error:
         draft = Path(f"{file.name.partition('.')[0]}_joints.yaml")
         if not draft.exists():  # it may have been filled in
-            draft.write_text(skeleton.guess(names, parents))
+            draft.write_text(skeleton.guess(names, parents), encoding="utf-8")
         raise ValueError(f"{error}; {draft} is a first guess of one") from error
 
 
@@ -161,8 +162,11 @@ def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, option
         The number of frames that are saved.
 
     Raises:
-        ValueError: as `mend`.
+        ValueError: as `mend`; for a figure that is too far from the ground.
     """
+    height = float(np.median(np.abs(motion.translation[:, 1])))
+    if height > HIGHEST:
+        raise ValueError(f"{recording}: the hips would be {height:.0f} m above the ground: give --up, or cut jumps out")
     motion, report = mend(motion, rig.body, options.bad)
     name = recording.name.partition(".")[0]
     save_motion(output, motion, rig.names, name=name, source=recording.name, licence=options.licence)

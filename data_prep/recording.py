@@ -10,6 +10,17 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of a recording
+
+
+GZIP = b"\x1f\x8b"
+OTHERS = {  # by how they begin
+    b"glTF": "a glTF file: data_prep.gltf_motion reads it",
+    b"Kaydara FBX": "an FBX file: make a glTF file of it, as data_prep/README.md says",
+    b"PK\x03\x04": "a ZIP archive: unpack it, or if it is an .npz let data_prep.amass read it",
+    b"\x89HDF": "an HDF5 file, not a recording of this kind",
+}
+
 
 class Capture(NamedTuple):
     """A recorded motion of a skeleton in any unit of length."""
@@ -48,15 +59,20 @@ def resample(capture: Capture, fps: float) -> Capture:
 
 
 def read_lines(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and words of each line that is not blank, of a text file or its .gz.
+    """Yield number and words of each line that is not blank, of a text file, which may be packed by gzip.
 
     Raises:
-        ValueError: if the file cannot be read.
+        ValueError: if the file cannot be read, or holds no text.
     """
     try:
-        opener = open_gzip if str(path).endswith(".gz") else open
+        with open(path, "rb") as file:
+            opener = open_gzip if file.read(len(GZIP)) == GZIP or str(path).endswith(".gz") else open
         with opener(path, "rb") as file:
-            marked = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+            begin = file.read(max(map(len, OTHERS)))
+        marked = begin[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        other = next((what for mark, what in OTHERS.items() if begin.startswith(mark)), None)
+        if other is not None:
+            raise ValueError(f"{path}: {other}")
         with opener(path, "rt", encoding="utf-16" if marked else "utf-8-sig", errors="replace") as file:
             for number, line in enumerate(file, 1):
                 words = line.split()

@@ -15,6 +15,7 @@ from data_prep.skeleton import SIDES, Parts, ancestors
 AXES = {sign + axis: (1 - 2 * (sign == "-")) * np.eye(3)["xyz".index(axis)] for axis in "xyz" for sign in ("", "-")}
 UPRIGHT = 0.6  # least cosine between the figure, on average over the frames, and the axis that is up
 STRAIGHT = 40.0  # degrees, by which trunk and legs of a rest pose may be off the vertical
+TWISTED, KNEES = 10.0, 25.0  # degrees, by which shoulders may be off the hips, and knees bent, in a rest pose
 ALONG = 3.0  # degrees, by which a rest pose that faces along an axis may be off it
 BENT = 0.15  # least sine of the angle of a knee or elbow that shows its hinge
 SEEN = 0.05  # share of the frames in which knees are bent, that shows which way they do
@@ -106,7 +107,7 @@ def sides(moving: Figure, parts: Parts) -> str:
 
 
 def is_rest_pose(resting: Figure, parts: Parts) -> str | None:
-    """Return the axis that points up in a pose [1, n] in which a figure stands with arms apart; None if it does not."""
+    """Return the axis that points up in a pose [1, n] in which a figure stands, arms apart, as in a T-pose, or None."""
     at = resting.positions[0]
     trunk = unit(at[parts.chain[-1]] - at[parts.hips])
     name = max(AXES, key=lambda axis: float(trunk @ AXES[axis]))
@@ -114,11 +115,14 @@ def is_rest_pose(resting: Figure, parts: Parts) -> str | None:
     across = unit(at[parts.limbs["left thigh"]] - at[parts.limbs["right thigh"]])
     good = [trunk @ up > limit, abs(across @ up) < 0.3]
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
-        leg = unit(at[parts.limbs[f"{side} foot"]] - at[parts.limbs[f"{side} thigh"]])
-        good.append(-leg @ up > limit)
+        thigh, shin, foot = (at[parts.limbs[f"{side} {part}"]] for part in ("thigh", "shin", "foot"))
+        good += [-unit(foot - thigh) @ up > limit, unit(shin - thigh) @ unit(foot - shin) > np.cos(np.radians(KNEES))]
         if f"{side} forearm" in parts.limbs:
             arm = unit(at[parts.limbs[f"{side} forearm"]] - at[parts.limbs[f"{side} upper arm"]])
             good += [sign * (arm @ across) > 0.15, abs(arm @ np.cross(across, up)) < 0.7]
+    arms = [parts.limbs.get(f"{side} upper arm") for side in SIDES]
+    if None not in arms:
+        good.append(unit(at[arms[0]] - at[arms[1]]) @ across > np.cos(np.radians(TWISTED)))
     return name if all(good) else None
 
 
@@ -185,7 +189,7 @@ def _trunk(shown: Figure, resting: Figure, parts: Parts) -> dict[int, np.ndarray
     bones = [resting.bone(a, b)[0] for a, b in zip(chain, chain[1:], strict=False)]
     straight = all(bone @ line > np.cos(np.radians(STRAIGHT)) for bone in bones) and abs(line @ across) < 0.3
     if straight and None not in ends:
-        straight = resting.bone(ends[1], ends[0])[0] @ across > np.cos(np.radians(STRAIGHT))
+        straight = resting.bone(ends[1], ends[0])[0] @ across > np.cos(np.radians(TWISTED))
     if straight:
         return dict.fromkeys(chain, upright_pose @ basis(line, across).T)
     hips = shown.bone(limbs["right thigh"], limbs["left thigh"])

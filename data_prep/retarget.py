@@ -73,12 +73,17 @@ def retarget(
             it, or the axes do not go together; if left and right contradict the figure; if the result differs from the
             recording; if the recording is shorter than two frames.
     """
+    if len(capture.translation) < 2:
+        raise ValueError(
+            f"{about}: a motion has two frames at least, not {len(capture.translation)}: take a longer one"
+        )
     capture = resample(capture, fps)
     names = cmu_names(names)
     of_body = skeleton.find(names, body.parents, "the body")
     of_file = skeleton.find(capture.names, capture.parents, about) if parts is None else parts
     shown = figure(capture, capture.rotations, capture.translation)
     resting = figure(capture, np.tile(np.eye(3), (1, len(capture.names), 1, 1)), np.zeros((1, 3)))
+    _refuse_lost_bones(capture, shown, of_file, about)
     wrong = "" if allow else rest_pose.sides(shown, of_file)
     if wrong:
         raise ValueError(
@@ -95,6 +100,11 @@ def retarget(
         leg = leg_length(shown.positions[0], of_file)
     else:
         if rest is None:
+            if not allow and any(end.endswith(" hand") for end in _absent_ends(of_file)):
+                raise ValueError(
+                    f"{about}: it has no hands, and its rest pose is no T-pose, so its forearms are not seen: export "
+                    "it with hands or in a T-pose; --allow takes it all the same"
+                )
             frame = rest_pose.straightest(shown, of_file)
             reference = rest_pose.standing(shown, resting, capture.parents, of_file, frame)
             tell(
@@ -133,6 +143,25 @@ def retarget(
         remedy = "" if by_positions else "--by-positions leaves the recording's rotations; "
         compare(motion, body, of_body, shown, of_file, about, abduct + drop_clavicles, remedy)
     return motion
+
+
+def _absent_ends(parts: Parts) -> list[str]:
+    """Return the parts at which limbs should end, that are not there."""
+    return [end for part in parts.limbs if (end := skeleton.end_of(part)) and end not in parts.limbs]
+
+
+def _refuse_lost_bones(capture: Capture, shown: Figure, parts: Parts, about: str) -> None:
+    """Refuse a figure whose hips or legs have no length, for the rest is then not where it should be either."""
+    ends = [(parts.limbs["left thigh"], parts.limbs["right thigh"])]
+    for side in skeleton.SIDES:
+        thigh, shin, foot = (parts.limbs[f"{side} {part}"] for part in ("thigh", "shin", "foot"))
+        ends += [(thigh, shin), (shin, foot)]
+    for start, end in ends:
+        if not shown.bone(start, end)[0].any():
+            raise ValueError(
+                f"{about}: {capture.names[start]} and {capture.names[end]} are at one place: export it with the "
+                "offsets of its joints"
+            )
 
 
 def _aligned(body: Body, of_body: Parts, posed: np.ndarray, of_file: Parts) -> dict[int, np.ndarray]:
@@ -217,7 +246,7 @@ def compare(
         motion: of the body.
         of_body, of_file: parts of the body and of the recording.
         shown: the recording, +y up.
-        allowance: degrees by which arms may differ further, because that was asked for.
+        allowance: degrees by which arms and shoulders may differ further, because that was asked for.
         remedy: what else may help.
 
     Raises:
@@ -228,6 +257,8 @@ def compare(
     def directions(positions: np.ndarray, parts: Parts) -> dict[str, np.ndarray]:
         limbs = parts.limbs
         ends = {"trunk": (parts.hips, parts.chain[-1]), "hips": (limbs["right thigh"], limbs["left thigh"])}
+        if "left upper arm" in limbs and "right upper arm" in limbs:
+            ends["shoulders"] = (limbs["right upper arm"], limbs["left upper arm"])
         for part, joint in limbs.items():
             end = skeleton.end_of(part)
             if end in limbs and not end.endswith("toe"):
@@ -237,7 +268,7 @@ def compare(
     found, recorded = directions(positions, of_body), directions(shown.positions, of_file)
     apart = {
         part: np.degrees(np.arccos(np.clip(np.sum(found[part] * recorded[part], axis=1), -1.0, 1.0)))
-        - (allowance if part.endswith("arm") else 0.0)
+        - (allowance if part.endswith(("arm", "shoulders")) else 0.0)
         for part in found.keys() & recorded.keys()
     }
     medians = {part: float(np.median(angles)) for part, angles in apart.items()}

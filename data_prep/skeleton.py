@@ -1,11 +1,12 @@
 """Which joint of a skeleton is which part of a body: by whole naming schemes, and by who hangs on whom.
 
 Known are the names of CMU, Mixamo, LaFAN1, Rokoko, Xsens, 100STYLE, Bandai-Namco, SMPL, Daz, Unreal and MetaHuman, VRM,
-Rigify and 3ds Max Biped, with any prefix that all joints share. Arms and legs may follow two schemes. For other names
-there is a mapping file (`mapped`).
+Rigify, 3ds Max Biped and Cats, with any prefix that all joints share. Arms and legs may follow two schemes. For other
+names there is a mapping file (`mapped`).
 """
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ ARMS = (  # names of ARM by scheme, without side and separators
     ("shoulder", "upperarm", "forearm", "hand"),
     ("clavicle", "upperarm", "forearm", "hand"),
     ("collar", "uparm", "lowarm", "hand"),
+    ("shoulder", "arm", "elbow", "wrist|hand"),
 )
 LEGS = (  # with what a toe is called
     ("upleg", "leg", "foot", "toebase|toe"),
@@ -35,6 +37,7 @@ LEGS = (  # with what a toe is called
     ("thigh", "calf", "foot", "ball|toe0|toe"),
     ("upperleg", "lowerleg", "foot", "toes|toe|toebase"),
     ("upleg", "lowleg", "foot", "toe"),
+    ("leg", "knee", "ankle", "toe"),
 )
 
 
@@ -103,12 +106,30 @@ def mapped(names: tuple[str, ...], parents: np.ndarray, path: Path, allow: bool 
         ValueError: naming the file, for what is not a part, not a joint, or missing.
     """
     try:
-        rows = yaml.safe_load(path.read_text())
+        rows = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: not a mapping of joints ({error})") from error
     if not isinstance(rows, dict):
         raise ValueError(f"{path}: expected lines such as 'left upper arm: JOINT'")
     return told({str(part): str(joint) for part, joint in rows.items() if joint}, names, parents, str(path), allow)
+
+
+def figures(names: tuple[str, ...], parents: np.ndarray, joints: Path | None = None) -> list[Parts]:
+    """Return the parts of each figure whose joints are known, in the order of the joints.
+
+    Args:
+        names: of the joints; those of another figure may be the same.
+        parents: [n] of the joints, -1 for a root; parents come first.
+        joints: a mapping file, as of `mapped`; None to go by the names.
+    """
+    found: list[Parts] = []
+    with suppress(ValueError):  # at last no more are known
+        while True:
+            allow = not found  # a second figure is one for certain only if it is whole
+            found.append(mapped(names, parents, joints, allow) if joints else find(names, parents, allow=allow))
+            hips = found[-1].hips
+            names = tuple("" if hips in ancestors(j, parents) else name for j, name in enumerate(names))
+    return found
 
 
 def told(rows: dict[str, str], names: tuple[str, ...], parents: np.ndarray, about: str, allow: bool = False) -> Parts:
@@ -173,11 +194,12 @@ def _known(names: tuple[str, ...], parents: np.ndarray) -> tuple[dict[str, int],
 def _without_prefix(names: tuple[str, ...]) -> list[str]:
     """Return names without a namespace, and without a prefix that ends in a separator and that nearly all share."""
     plain = [name.rpartition(":")[2] or name for name in names]
+    named = sum(map(bool, plain))
     starts = [re.match(r"^[A-Za-z0-9]+?[_ ]", name) for name in plain]
     counted = [match.group() for match in starts if match]
     for prefix in set(counted):
         side = prefix[:-1].lower() in ("l", "r", *SIDES)
-        if not side and counted.count(prefix) > 0.5 * len(plain):
+        if not side and counted.count(prefix) > 0.5 * named:
             return _without_prefix(tuple(name.removeprefix(prefix) or name for name in plain))  # such as J_Bip_
     return plain
 
@@ -207,6 +229,8 @@ def _split(name: str) -> tuple[str, str]:
 def _limbs(sided: dict, parents: np.ndarray, parts: tuple[str, ...], schemes: tuple) -> dict[str, int]:
     """Return the joints of the limbs of the scheme that names most of them, each hanging on the one before."""
     best: dict[str, int] = {}
+    cores_of_all = {core for scheme in schemes for cores in scheme for core in cores.split("|")}
+    of_schemes = {joint for (_, core), joint in sided.items() if core in cores_of_all}
     for scheme in schemes:
         found = {}
         for side in SIDES:
@@ -216,16 +240,21 @@ def _limbs(sided: dict, parents: np.ndarray, parts: tuple[str, ...], schemes: tu
             }
             present = [(part, joint) for part, joint in joints.items() if joint is not None]
             hangs = all(a[1] in ancestors(b[1], parents)[1:] for a, b in zip(present, present[1:], strict=False))
-            needed = all(joints[part] is not None for part in parts if part in NEEDED)
-            if hangs and needed:
+            needed = [joints[part] for part in parts if part in NEEDED]
+            if hangs and None not in needed and not _between(needed, parents) & of_schemes:
                 found |= {f"{side} {part}": joint for part, joint in present}
         if len(found) > len(best):
             best = found
     return best
 
 
+def _between(chain: list[int], parents: np.ndarray) -> set[int]:
+    """Return the joints between those of a chain, in which each hangs on the one before."""
+    return {j for a, b in zip(chain, chain[1:], strict=False) for j in ancestors(b, parents)[1:] if j > a}
+
+
 def _whole(names: tuple[str, ...], parents: np.ndarray, limbs: dict, central: dict, about: str, allow: bool) -> Parts:
-    """Complete the parts: the hips carry both legs, the chest both arms; the spine lies between, the neck above."""
+    """Complete the parts: the chest carries both arms, the hips it and both legs; the neck is above the spine."""
     missing = [f"{side} {part}" for side in SIDES for part in NEEDED if f"{side} {part}" not in limbs]
     head = next((central["", core] for core in ("head", "spine006", "neck", "neck01") if ("", core) in central), None)
     if head is None:
@@ -235,18 +264,21 @@ def _whole(names: tuple[str, ...], parents: np.ndarray, limbs: dict, central: di
             f"{about}: no joint is known as {', '.join(missing)} among {', '.join(names)}: "
             "rename them, or name them in a file (--joints map.yaml)"
         )
-    left, right = (ancestors(limbs[f"{side} thigh"], parents)[1:] for side in SIDES)
-    shared = [joint for joint in left if joint in right]
-    if not shared:
-        raise ValueError(f"{about}: the legs do not hang on one joint")
-    hips = central.get(("", "hips"))
-    hips = hips if hips in shared else shared[0]
     carriers = [ancestors(limbs[f"{side} upper arm"], parents)[1:] for side in SIDES if f"{side} upper arm" in limbs]
     carriers += [ancestors(head, parents)[1:]] if len(carriers) < 2 and head is not None else []
-    carriers = carriers or [[hips]]
-    chest = next((joint for joint in carriers[0] if all(joint in other for other in carriers)), hips)
-    spine = ancestors(chest, parents)
-    spine = spine[: spine.index(hips)] if hips in spine else []
+    chest = (
+        next((joint for joint in carriers[0] if all(joint in other for other in carriers)), None) if carriers else None
+    )
+    spine = [] if chest is None else ancestors(chest, parents)
+    left, right = (ancestors(limbs[f"{side} thigh"], parents)[1:] for side in SIDES)
+    shared = [joint for joint in left if joint in right and (joint in spine or chest is None)]
+    if not shared:
+        raise ValueError(
+            f"{about}: its legs and its chest do not hang on one joint: export it with the joint that does"
+        )
+    hips = central.get(("", "hips"))
+    hips = hips if hips in shared else shared[0]
+    spine = spine[: spine.index(hips)] if spine else []
     neck = [] if head is None else ancestors(head, parents)
     below = next((k for k, joint in enumerate(neck) if joint in (*spine, *ancestors(hips, parents))), len(neck))
     return Parts(hips, tuple(spine[::-1]), tuple(neck[:below][::-1]), limbs)

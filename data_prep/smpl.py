@@ -22,6 +22,7 @@ from clothjax.files.damage import UNREADABLE
 from clothjax.files.storage import save_body
 from clothjax.types import Body
 from data_prep.program import run
+from data_prep.recording import GZIP
 
 BODY = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
@@ -39,6 +40,10 @@ NAMES = {
 }
 EXPRESSIVE = {20: 10, 400: 300}  # shape parameters of SMPL-X among its columns; expressions follow
 KEYS = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table")
+
+
+LEFT = tuple(f"left_{part}" for part in ("hip", "knee", "ankle", "collar", "shoulder", "elbow", "wrist"))
+TALL, OUTSIDE = (0.3, 3.0), 0.1  # m; share of that, by which a joint may be outside of its mesh
 
 
 class _Placeholder:
@@ -116,6 +121,9 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
                 arrays = {key: file[key] for key in (*KEYS, "posedirs") if key in file.files}
         else:
             with path.open("rb") as file:
+                if file.read(len(GZIP)) == GZIP:
+                    raise ValueError("it is packed by gzip: unpack it")
+                file.seek(0)
                 model = _Unpickler(file, encoding="latin1").load()
             arrays = {key: _array(model[key]) for key in (*KEYS, "posedirs") if key in model}
     except FileNotFoundError:
@@ -194,6 +202,12 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
     faces = floats("f", None, 3)
     if faces.min() < 0 or faces.max() >= count:
         raise ValueError(f"{path}: f: a face names vertex {int(faces.max())} of {count}")
+    if weights.min() < 0 or np.abs(weights.sum(axis=1) - 1).max() > 1e-3:
+        wrong = int(np.argmax(np.abs(weights.sum(axis=1) - 1) + np.minimum(weights.min(axis=1), 0) ** 2))
+        raise ValueError(
+            f"{path}: weights of vertex {wrong} sum to {weights[wrong].sum():.3g}, the least is "
+            f"{weights[wrong].min():.3g}: they must be >= 0 and sum to 1"
+        )
     posedirs = floats("posedirs", count, 3, 9 * (joints - 1)).astype(np.float32) if "posedirs" in arrays else None
     return Body(
         vertices=vertices.astype(np.float32),
@@ -205,6 +219,32 @@ def body(path: str | Path, shapes: int = 10) -> tuple[Body, tuple[str, ...]]:
         joint_shapedirs=np.einsum("jv,vcs->jcs", regressor, shapedirs).astype(np.float32),
         posedirs=posedirs,
     ), NAMES[joints]
+
+
+def misplaced(body: Body) -> str:
+    """Say how a body with SMPL's joints is not one in metres that stands along +y, faces +z, left at +x; or nothing."""
+    vertices, joints = np.asarray(body.vertices, np.float64), np.asarray(body.joints, np.float64)
+    at = dict(zip(BODY, joints, strict=False))
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    tall = high[1] - low[1]
+    low, high = low - OUTSIDE * tall, high + OUTSIDE * tall
+    trunk = at["head"] - at["pelvis"]
+    if np.abs(trunk).argmax() != 1 or trunk[1] < 0:
+        return "its head is not above its pelvis along +y: turn v_template and shapedirs"
+    if not TALL[0] < tall < TALL[1]:
+        return f"it is {tall:.3g} tall, which is not in m: scale v_template and shapedirs"
+    if (joints < low).any() or (joints > high).any():
+        outside = int(((joints < low) | (joints > high)).any(axis=1).argmax())
+        return f"joint {outside}, of J_regressor, is outside of v_template: the two do not belong together"
+    across = [at[left][0] - at[left.replace("left", "right")][0] for left in LEFT]
+    ahead = np.mean([at[f"{side}_foot"][2] - at[f"{side}_ankle"][2] for side in ("left", "right")])
+    if max(across) < 0 and ahead < 0:
+        return "it faces -z: turn v_template and shapedirs by half a turn about y"
+    if min(across) < 0 or ahead < 0:
+        return "its left is not at +x, or its toes not at +z: it is mirrored, or joints are in another order"
+    if np.linalg.det(vertices[np.asarray(body.faces)]).sum() < 0:
+        return "its faces are seen from inside: turn each around in f"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -221,6 +261,9 @@ class Arguments:
 def main(args: Arguments) -> None:
     """Write the body file."""
     result, names = body(args.model, args.shapes)
+    wrong = misplaced(result)
+    if wrong:
+        raise ValueError(f"{args.model}: {wrong}")
     save_body(args.output, result, names, name=args.output.stem, source=args.model.name, licence="of the model")
     print(f"{args.output}: {len(result.vertices)} vertices, {len(names)} joints, {args.shapes} shape parameters")
 

@@ -254,21 +254,46 @@ Frame Time: 0.0083333
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 
 
+SIDED = {
+    1: (0.1, -0.05, 0),
+    4: (0.1, -0.4, 0),
+    7: (0.1, -0.75, 0),
+    10: (0.1, -0.8, 0.1),
+    13: (0.05, 0.4, 0),
+    16: (0.15, 0.4, 0),
+    18: (0.3, 0.4, 0),
+    20: (0.42, 0.4, 0),
+    22: (0.47, 0.4, 0),
+}  # the left ones
+MIDDLE = {0: 0.0, 3: 0.1, 6: 0.2, 9: 0.3, 12: 0.45, 15: 0.6}  # heights
+
+
+def smpl_regressor(vertices: np.ndarray) -> scipy.sparse.csc_matrix:
+    """What makes SMPL's 24 joints, within an ellipsoid as high as a person, of its vertices."""
+    joints = np.zeros((24, 3))
+    for joint, place in SIDED.items():
+        joints[joint], joints[joint + 1] = place, place * np.array([-1, 1, 1])
+    for joint, height in MIDDLE.items():
+        joints[joint, 1] = height
+    wanted = np.c_[joints, np.ones(24)].T
+    return scipy.sparse.csc_matrix(np.linalg.lstsq(np.c_[vertices, np.ones(len(vertices))].T, wanted)[0].T)
+
+
 def smpl_arrays() -> dict:
     """A body of 24 joints with SMPL's arrays, of few vertices."""
     rng = np.random.default_rng(0)
     mesh = trimesh.creation.icosphere(1)
-    count = len(mesh.vertices)
+    vertices, count = np.asarray(mesh.vertices) * [0.5, 0.85, 0.2], len(mesh.vertices)
     weights = rng.uniform(size=(count, 24))
     table = np.array([PARENTS, range(24)])
     table[0, 0] = 2**32 - 1
     return {
-        "v_template": np.asarray(mesh.vertices) * [0.5, 0.85, 0.2],
+        "v_template": vertices,
         "f": np.asarray(mesh.faces, np.uint32),
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "shapedirs": 0.01 * rng.normal(size=(count, 3, 12)),
         "posedirs": 0.01 * rng.normal(size=(count, 3, 207)),
-        "J_regressor": scipy.sparse.csc_matrix(np.full((24, count), 1 / count)),
+        "J_regressor": smpl_regressor(vertices),
         "kintree_table": table,
     }
 

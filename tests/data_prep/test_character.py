@@ -1,5 +1,7 @@
 """A rigged character in a glTF file becomes a body, and its animations motions, whatever program it is from."""
 
+import copy
+import json
 import re
 
 import igl
@@ -275,3 +277,169 @@ def test_keys_are_interpolated_as_the_standard_says(how):
     else:
         expected = {"STEP": [0, 0, 0, 2, 2, 0, 0], "LINEAR": [0, 0, 1, 2, 1, 0, 0]}[how]
         np.testing.assert_allclose(gltf_file._sampled(times, keys, values, how)[:, 0], expected)
+
+
+# What else is in a file
+
+
+def changed(path, change):
+    """Change the JSON of a .glb, with a function that adds numbers to its data."""
+    data = path.read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    document, binary = json.loads(data[20 : 20 + size]), bytearray(data[28 + size :])
+
+    def add(array, kind="VEC4"):
+        array = np.ascontiguousarray(array, np.float32)
+        view = {"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes}
+        binary.extend(array.tobytes())
+        document["bufferViews"].append(view)
+        entry = {"bufferView": len(document["bufferViews"]) - 1, "componentType": rigged.FLOAT, "count": len(array)}
+        document["accessors"].append(entry | {"type": kind})
+        return len(document["accessors"]) - 1
+
+    def read(index):
+        entry = document["accessors"][index]
+        view = document["bufferViews"][entry["bufferView"]]
+        flat = np.frombuffer(bytes(binary), np.float32, view["byteLength"] // 4, view["byteOffset"])
+        return flat.reshape(entry["count"], -1).copy()
+
+    change(document, add, read)
+    document["buffers"][0]["byteLength"] = len(binary)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = [len(text).to_bytes(4, "little") + b"JSON" + text, len(binary).to_bytes(4, "little") + b"BIN\0" + binary]
+    whole = 12 + sum(map(len, chunks))
+    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + whole.to_bytes(4, "little") + b"".join(chunks))
+    return path
+
+
+def doubled(document, add, read):
+    """Put a second figure that stands still first in the scene, which the animation has keys for."""
+    count, animation = len(document["nodes"]), document["animations"][0]
+    for node in copy.deepcopy(document["nodes"]):
+        node["children"] = [child + count for child in node.get("children", ())]
+        document["nodes"].append({key: node[key] for key in node if key not in ("mesh", "skin")})
+    document["scenes"][0]["nodes"] = [node + count for node in document["scenes"][0]["nodes"]] + document["scenes"][0][
+        "nodes"
+    ]
+    for channel in list(animation["channels"]):
+        node = channel["target"]["node"]
+        if channel["target"]["path"] == "rotation" and "rotation" in document["nodes"][node]:
+            frames = document["accessors"][animation["samplers"][0]["input"]]["count"]
+            output = add(np.tile(document["nodes"][node]["rotation"], (frames, 1)))
+            animation["samplers"].append({"input": animation["samplers"][0]["input"], "output": output})
+            target = {"node": node + count, "path": "rotation"}
+            animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
+
+
+def with_a_camera(document, add, read):
+    """Put a camera that turns first in the scene."""
+    document["nodes"].append({"name": "Camera"})
+    node, animation = len(document["nodes"]) - 1, document["animations"][0]
+    document["scenes"][0]["nodes"].insert(0, node)
+    animation["channels"].append({"sampler": 0, "target": {"node": node, "path": "rotation"}})
+
+
+def without_hips(document, add, read):
+    """Leave out the channel that turns the hips."""
+    animation = document["animations"][0]
+    kept = [c for c in animation["channels"] if (c["target"]["node"], c["target"]["path"]) != (0, "rotation")]
+    animation["channels"] = kept
+
+
+def test_the_figure_is_found_among_other_nodes_that_turn(rig, walk, tmp_path):
+    path, lines = written(tmp_path, rig.body, rig.names, walk), []
+    wanted = gltf_motion.read_gltf(path, walk.fps)
+    found = gltf_motion.read_gltf(changed(path, with_a_camera), walk.fps, tell=lines.append)
+    assert found.names == wanted.names and lines == []
+    np.testing.assert_allclose(found.rotations, wanted.rotations)
+    found = gltf_motion.read_gltf(changed(path, without_hips), walk.fps)
+    assert found.names == wanted.names
+    np.testing.assert_allclose(found.rotations[:, 1:], wanted.rotations[:, 1:], atol=1e-6)
+    gltf_motion.read_gltf(changed(path, doubled), walk.fps, tell=lines.append)
+    assert len(lines) == 1 and "there are two figures: that of node " in lines[0]
+
+
+def test_names_of_a_humanoid_win(rig, walk, tmp_path):
+    """The bone of the lower back is called as an arm."""
+    names, options = dialect("vrm 0", rig, None)
+    rigged.write(tmp_path / "c.glb", rig.body, names, walk, **options)
+    wanted = gltf_motion.read_gltf(tmp_path / "c.glb", walk.fps)
+    other = tuple("LeftArm" if joint == "LowerBack" else own for own, joint in zip(names, rig.names))
+    rigged.write(tmp_path / "c.glb", rig.body, other, walk, **options)
+    found = gltf_motion.read_gltf(tmp_path / "c.glb", walk.fps)
+    assert found.names.index("LeftArm") == wanted.names.index("LeftArm") == rig.names.index("LeftArm")
+
+
+def test_steps_at_the_rate_of_the_result_are_its_frames():
+    keys = np.float32(np.arange(200) / np.float32(30.0)).astype(np.float64)
+    found = gltf_file._sampled(np.arange(200) / 30, keys, np.arange(200.0)[:, None], "STEP")[:, 0]
+    np.testing.assert_array_equal(found, np.arange(200))
+
+
+@pytest.mark.parametrize("wrong, told", [("frames", "its 40 keys are 1 s apart: are its times in seconds"),
+                                         ("ms", "its 40 keys are 33.3 s apart"),
+                                         ("twice", "the rotation of mixamorig:Hips: key 10 is not after key 9"),
+                                         ("zero", "the rotation of .* is no rotation at key 7"),
+                                         ("nan", "the rotation of .* has a key that is not finite"),
+                                         ("no file", "its data are in .*away.bin, which is not there"),
+                                         ("old", "glTF of version 1, not 2")])  # fmt: skip
+def test_keys_and_files_that_are_wrong_are_named(wrong, told, rig, walk, tmp_path):
+    def change(document, add, read):
+        samplers = document["animations"][0]["samplers"]
+        times, output = read(samplers[0]["input"]), read(samplers[5]["output"])
+        factor = {"frames": 30, "ms": 1000}.get(wrong, 1)
+        times[10] = times[9] if wrong == "twice" else times[10]
+        index = add(factor * times, "SCALAR")
+        for sampler in samplers:
+            sampler["input"] = index
+        output[7] = {"zero": 0, "nan": np.nan}.get(wrong, output[7])
+        samplers[5]["output"] = add(output)
+
+    path = changed(written(tmp_path, rig.body, rig.names, walk), change)
+    if wrong == "old":
+        path.write_bytes(path.read_bytes()[:4] + (1).to_bytes(4, "little") + path.read_bytes()[8:])
+    if wrong == "no file":
+        changed(path, lambda document, add, read: document["buffers"][0].update(uri="away.bin"))
+    with pytest.raises(ValueError, match=rf"c\.glb: {told}"):
+        gltf_motion.read_gltf(path, 30.0)
+    if wrong == "zero":
+        with pytest.raises(ValueError, match=rf"c\.glb, animation a_walk: {told}"):
+            gltf.motions(character.read(path), 30.0)
+
+
+def test_objects_that_were_bound_in_other_poses_are_put_together(rig, walk, tmp_path):
+    """The left arm was bound hanging down, the rest in a T-pose."""
+    body = rigged.coarse(rig.body)
+    faces, vertices = np.asarray(body.faces), 100 * np.asarray(body.vertices)
+    outer = np.abs(vertices[faces].mean(axis=1)[:, 0]) > 30
+    path = written(tmp_path, body, rig.names, walk, objects={"Body": faces[~outer], "Arms": faces[outer]})
+    wanted, shoulder = character.read(path).bound.vertices, rig.names.index("LeftArm")
+    arm = [shoulder in skeleton.ancestors(j, body.parents) for j in range(len(rig.names))]
+    of_arm = np.asarray(body.weights)[:, arm].sum(axis=1)
+    turn, place = np.eye(4), 100 * np.asarray(body.joints)[shoulder]
+    turn[:3, :3] = Rotation.from_euler("z", -60, degrees=True).as_matrix()
+    turn[:3, 3] = place - turn[:3, :3] @ place
+
+    def change(document, add, read):
+        inverse = read(document["skins"][0]["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+        inverse[arm] = inverse[arm] @ np.linalg.inv(turn)
+        index = add(inverse.swapaxes(1, 2).reshape(-1, 16), "MAT4")
+        document["skins"].append({"joints": document["skins"][0]["joints"], "inverseBindMatrices": index})
+        moved = vertices @ turn[:3, :3].T + turn[:3, 3]
+        points = add(of_arm[:, None] * moved + (1 - of_arm)[:, None] * vertices, "VEC3")
+        node = next(node for node in document["nodes"] if node.get("name") == "Arms")
+        node["skin"] = 1
+        document["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"] = points
+
+    found = character.read(changed(path, change))
+    assert any("bound in another pose than the largest one" in line for line in found.log)
+    whole = np.tile((of_arm < 0.01) | (of_arm > 0.99), 2)  # of others a mean of two places is not undone
+    np.testing.assert_allclose(found.bound.vertices[whole], wanted[whole], atol=5e-3)
+
+
+def test_a_mesh_elsewhere_than_its_joints_is_refused(rig, walk, tmp_path):
+    path = written(tmp_path, rig.body, rig.names, walk)
+    changed(path, lambda document, add, read: document["skins"][0].pop("inverseBindMatrices"))
+    with pytest.raises(ValueError, match=r"c\.glb: its joints, .* tall, are not in its mesh, .*: bind the mesh"):
+        character.read(path)

@@ -339,6 +339,15 @@ def test_a_round_seam_whose_sides_have_other_vertices_is_noticed(upper, lower, b
     assert len(boundary_loops(made.faces)) == 2 and "sewn: 2 pieces along 1 seam" in said
 
 
+def test_a_seam_of_which_every_third_vertex_is_off_is_noticed(body, names, save):
+    """All else is welded: what stays open are slits of two centimetres."""
+    upper, faces = tube(np.linspace(0.1, 0.0, 10), 0.2, 120)
+    seam = np.arange(len(upper) - 120, len(upper), 3)
+    upper[seam, 1] += 5e-4
+    with pytest.raises(ValueError, match=r"two borders run 0\.\d mm beside each other.*--sew 1 sews it"):
+        bring(save((upper, faces), tube(np.linspace(0.0, -0.3, 30), 0.2, 120)), body, names, TIGHT)
+
+
 @pytest.mark.parametrize("apart", [0.022, 0.03])
 def test_what_has_no_opening_is_no_cloth(apart, sheet, body, names, save):
     """Thicker than layers are looked for."""

@@ -282,6 +282,16 @@ def test_an_obj_file_as_programs_write_it(encoding, tmp_path):
     assert mesh.vertices[mesh.red].tolist() == [[0, 0, 0]]
 
 
+@pytest.mark.parametrize("most", [1.0, 255])
+def test_colours_of_an_off_file(most, tmp_path):
+    colours = [[most, 0, 0, most], [most, most, most, most], [0, 0, 0, most]]
+    rows = [" ".join(map(str, (*point, *colour))) for point, colour in zip(SQUARE, colours)]
+    (tmp_path / "a.off").write_text("\n".join(["COFF", "3 1 0", *rows, "3 0 1 2"]))
+    mesh = mesh_file.read(tmp_path / "a.off")
+    assert mesh.red.tolist() == [True, False, False]
+    np.testing.assert_array_equal(mesh.vertices, SQUARE[:3])
+
+
 @pytest.mark.parametrize("line, told", [
     ("f 0 1 2", "line 4: a face names vertex 0, but OBJ counts from 1"),
     ("v 0,5 0 0", "line 4: '0,5 0 0' should be numbers with a point in place of the comma"),

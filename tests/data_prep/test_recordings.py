@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import CROSSED, Take, other_side, write_bvh
+from recorded import CROSSED, KEPT, Take, joints, named, other_side, take, with_axes, write_bvh
+from samples import AMC, ASF
 from scipy.spatial.transform import Rotation
 
-from clothjax.body.plausibility import body_kinematics, joint_positions
+from clothjax.body.joint_names import CMU_FROM_SMPL
+from clothjax.body.plausibility import body_kinematics, joint_positions, kinematics
 from clothjax.files import storage
-from data_prep import amass, bvh, procedural, program, rest_pose, retarget, skeleton
+from data_prep import amass, asf_amc, bvh, procedural, program, rest_pose, retarget, skeleton
 from data_prep.recording import Capture, resample
 from data_prep.smpl import BODY
 
@@ -345,6 +347,205 @@ def test_resampling_keeps_what_is_smooth():
     np.testing.assert_allclose(found.translation[5:55, 0], np.sin(2 * np.pi * new), atol=0.002)
 
 
+# What hangs together otherwise
+
+
+def carried(taken, above, beside=(), turn=None):
+    """A recording below joints that are still, with others beside the figure; the path stays on its hips."""
+    count, n = len(taken.places), len(above)
+    turns = np.tile(np.eye(3) if turn is None else turn, (count, 1, 1, 1))
+    rest = np.tile(np.eye(3), (count, len(beside), 1, 1))
+    back = np.swapaxes(turns[:, 0], -1, -2)
+    rotations, places = taken.rotations.copy(), taken.places.copy()
+    rotations[:, 0], places[:, 0] = back @ rotations[:, 0], np.einsum("tab,tb->ta", back, places[:, 0])
+    others = np.tile(np.eye(3), (count, n - 1, 1, 1))
+    return Take(
+        (*above, *taken.names, *beside),
+        np.array([*range(-1, n - 1), *np.where(taken.parents < 0, n - 1, taken.parents + n), *[0] * len(beside)]),
+        np.concatenate([np.zeros((count, n, 3)), places, np.zeros((count, len(beside), 3))], axis=1),
+        np.concatenate([turns, others, rotations, rest], axis=1),
+        np.array([True] * n + [*(taken.parents < 0)] + [False] * len(beside)),
+    )
+
+
+@pytest.mark.parametrize(
+    "above, beside, turn",
+    [(("root",), ("ik_foot_root", "ik_hand_root"), None), (("Armature", "root"), (), None),
+     (("Armature", "root"), ("Camera",), Z_UP)],
+)  # fmt: skip
+def test_the_path_is_that_of_the_hips_whatever_they_hang_on(above, beside, turn, rig, tmp_path):
+    taken = take("walk", 0, 30)
+    write_bvh(tmp_path / "plain.bvh", taken, "0.0333333", ["zxy"] * len(taken.names))
+    both = carried(taken, above, beside, turn)
+    write_bvh(tmp_path / "carried.bvh", both, "0.0333333", ["zxy"] * len(both.names))
+    wanted, found = (retargeted(tmp_path / f"{name}.bvh", rig)[0] for name in ("plain", "carried"))
+    np.testing.assert_allclose(found, wanted, atol=2e-3)
+    assert np.ptp(found[:, 0, 2]) > 1
+
+
+def test_a_second_figure_is_told(tmp_path):
+    taken, lines = take("walk", 0, 30), []
+    n = len(taken.names)
+    both = Take(
+        ("Scene", *(f"A:{name}" for name in taken.names), *(f"B:{name}" for name in taken.names)),
+        np.concatenate([[-1], *(np.where(taken.parents < 0, 0, taken.parents + k) for k in (1, 1 + n))]),
+        np.concatenate([0 * taken.places[:, :1], taken.places, taken.places], axis=1),
+        np.concatenate([np.tile(np.eye(3), (len(taken.places), 1, 1, 1)), taken.rotations, taken.rotations], axis=1),
+        np.array([True, *taken.moving, *taken.moving]),
+    )  # fmt: skip
+    write_bvh(tmp_path / "two.bvh", both, "0.0333333", ["zxy"] * len(both.names))
+    capture = bvh.read_bvh(tmp_path / "two.bvh", lines.append)
+    assert len(capture.names) == n
+    assert lines == ["there are two figures: that of A:Hips is taken, that of B:Hips is left out"]
+
+
+@pytest.mark.parametrize("leg", ["Hip,Knee,Ankle,Toe", "Leg,Knee,Ankle,Toe"])
+def test_an_arm_may_hang_on_a_shoulder_and_bend_at_an_elbow(leg, plain, rig, tmp_path):
+    parts = dict(zip(LIMBS, ("Shoulder", "Arm", "Elbow", "Wrist", *leg.split(","))))
+    path = dialect(tmp_path / "walk.bvh", name=lambda side, part: side + parts.get(part, part))
+    np.testing.assert_allclose(retargeted(path, rig)[0], plain, atol=1e-4)
+
+
+def test_a_scheme_that_skips_a_known_joint_is_none():
+    """From a shoulder to an elbow, with an arm between."""
+    other = {"Shoulder": "Collar", "Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist"}
+    names, parents, _ = skeleton_of(lambda side, part: side + other.get(part, part))
+    assert names[skeleton.find(names, parents).limbs["left upper arm"]] == "LeftShoulder"
+    other |= {"Shoulder": "Shoulder", "Arm": "UpperArm"}
+    names, parents, _ = skeleton_of(lambda side, part: side + other.get(part, part))
+    with pytest.raises(ValueError, match="no joint is known as left upper arm"):
+        skeleton.find(names, parents)
+
+
+def test_hips_carry_legs_and_chest(rig):
+    """As in Character Creator: hip -> {pelvis -> legs, waist}."""
+    names, parents, _ = skeleton_of(lambda side, part: side + part)
+    below = np.array([-1, 0, *(1 if p == 0 and name.endswith("UpLeg") else 0 if p == 0 else p + 1
+                               for name, p in zip(names[1:], parents[1:]))])  # fmt: skip
+    parts = skeleton.find(("CC_Base_Hip", "CC_Base_Pelvis", *names[1:]), below)
+    assert parts.hips == 0 and len(parts.spine) == 2
+
+
+def test_positions_may_be_added_to_the_offsets(plain, rig, tmp_path):
+    """Millimetres of noise are no places on the parents."""
+    path = dialect(tmp_path / "walk.bvh")
+    capture = bvh.read_bvh(path)
+    added = 0.2 * np.random.default_rng(0).normal(size=(len(capture.translation), len(capture.names), 3))
+    added[:, 0] = capture.translation
+    taken = Take(capture.names, capture.parents, added, capture.rotations, np.full(len(capture.names), True))
+    write_bvh(path, taken, "0.0333333", ["zxy"] * len(capture.names))
+    lines = path.read_text().splitlines()
+    for k, words in enumerate(map(str.split, lines)):
+        if words[0] in ("ROOT", "JOINT"):
+            lines[k + 2] = "OFFSET {} {} {}".format(*capture.offsets[capture.names.index(words[1])])
+    path.write_text("\n".join(lines))
+    found, _ = retargeted(path, rig)
+    assert np.delete(np.linalg.norm(found - plain, axis=-1), beyond(rig), axis=1).max() < 0.01  # m
+
+
+def test_angles_that_may_be_radians_are_told(tmp_path):
+    path, lines = dialect(tmp_path / "walk.bvh"), []
+    bvh.read_bvh(path, lines.append)
+    assert lines == []
+    text = path.read_text().splitlines()
+    at = text.index("MOTION") + 3
+    rows = np.array([line.split() for line in text[at:]], float)
+    rows[:, 3:] = np.radians(rows[:, 3:])
+    path.write_text("\n".join([*text[:at], *(" ".join(map(str, row)) for row in rows)]))
+    bvh.read_bvh(path, lines.append)
+    assert len(lines) == 1 and "are they in radians?" in lines[0]
+
+
+@pytest.mark.parametrize("kind, frame", [("twist", 50), ("run", 20)])
+def test_a_frame_of_the_motion_is_no_t_pose(kind, frame, rig, tmp_path):
+    taken, lines = named(take(kind, 0, 30), {name: name for name in KEPT}), []
+    world = kinematics(taken.rotations, taken.places[:, 0], taken.places[0], taken.parents)[0]
+    turned = with_axes(taken, np.swapaxes(world[frame], -1, -2))
+    write_bvh(tmp_path / "walk.bvh", turned, "0.0333333", ["zxy"] * len(turned.names))
+    found, _ = retargeted(tmp_path / "walk.bvh", rig, tell=lines.append)
+    assert any("its rest pose is no T-pose" in line for line in lines)
+    at = [rig.names.index(name) for name in ("RightArm", "LeftArm")]
+    line, wanted = (x[:, at[1]] - x[:, at[0]] for x in (found, joints(kind, 0, 30)))
+    cosine = np.sum(rest_pose.unit(line) * rest_pose.unit(wanted), axis=1)
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 8
+
+
+def test_forearms_that_end_in_no_joint_are_refused_where_they_are_not_seen(rig, tmp_path):
+    names, parents, offsets = skeleton_of(lambda side, part: side + part)
+    kept = [j for j, name in enumerate(names) if not name.endswith("Hand")]
+    above = np.array([-1 if parents[j] < 0 else kept.index(parents[j]) for j in kept])
+    rotations, path = walk()
+    for own, fine in ((np.tile(np.eye(3), (len(names), 1, 1)), True), (own_axes(3), False)):
+        before = np.where((parents < 0)[:, None, None], np.eye(3), own[np.maximum(parents, 0)])
+        turned = np.swapaxes(before, -1, -2) @ rotations @ own
+        places = np.einsum("nba,nb->na", before, offsets)[kept]
+        write(tmp_path / "walk.bvh", tuple(names[j] for j in kept), above, places, turned[:, kept], path)
+        if fine:
+            retargeted(tmp_path / "walk.bvh", rig)
+        else:
+            with pytest.raises(
+                ValueError, match=r"walk\.bvh: it has no hands, and its rest pose is no T-pose.*--allow"
+            ):
+                retargeted(tmp_path / "walk.bvh", rig)
+
+
+def test_what_is_no_recording_is_refused_with_what_to_do(rig, tmp_path):
+    path = dialect(tmp_path / "walk.bvh")
+    with pytest.raises(ValueError, match=r"--skip -5: give how many"):
+        bvh.main(bvh.Arguments(path, tmp_path / "m.h5", skip=-5))
+    with pytest.raises(ValueError, match=r"walk\.bvh: a motion has two frames at least, not 1"):
+        bvh.main(bvh.Arguments(path, tmp_path / "m.h5", skip=39))
+    capture = bvh.read_bvh(path)
+    capture.offsets[[capture.names.index(f"{side}UpLeg") for side in ("Left", "Right")]] = 0
+    with pytest.raises(ValueError, match=r"walk: LeftUpLeg and RightUpLeg are at one place: export it"):
+        retarget.retarget(capture, *rig, about="walk")
+    packed = tmp_path / "packed.bvh"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert bvh.read_bvh(packed).names == capture.names
+    for begin, told in ((b"glTF", "a glTF file"), (b"Kaydara FBX Binary", "an FBX file")):
+        (tmp_path / "other.bvh").write_bytes(begin + bytes(100))
+        with pytest.raises(ValueError, match=rf"other\.bvh: {told}"):
+            bvh.read_bvh(tmp_path / "other.bvh")
+
+
+def test_a_motion_that_would_not_be_read_again_is_not_written(rig, tmp_path):
+    motion = procedural.generate("walk", 0, 2.0)
+    high = motion._replace(translation=motion.translation + [0, 30.0, 0])
+    with pytest.raises(ValueError, match=r"walk\.bvh: the hips would be 3\d m above the ground"):
+        program.write_motion(tmp_path / "m.h5", high, rig, Path("walk.bvh"), program.OutputOptions())
+    assert not (tmp_path / "m.h5").exists()
+
+
+def test_a_mapping_file_is_utf_8_everywhere(tmp_path, monkeypatch):
+    """Where the system's encoding is another one, too."""
+    monkeypatch.chdir(tmp_path)
+    write_text, read_text = Path.write_text, Path.read_text
+    monkeypatch.setattr(Path, "write_text", lambda path, text, encoding="ascii": write_text(path, text, encoding))
+    monkeypatch.setattr(Path, "read_text", lambda path, encoding="ascii": read_text(path, encoding))
+    names, parents, _ = skeleton_of(lambda side, part: f"骨{side}X{part}")
+    with pytest.raises(ValueError, match="walk_joints"):
+        program.known_parts(names, parents, None, Path("walk.bvh"))
+    with pytest.raises(ValueError, match=r"walk_joints\.yaml: no joint is known as"):
+        program.known_parts(names, parents, Path("walk_joints.yaml"), Path("walk.bvh"))
+    assert "骨LeftXArm" in (tmp_path / "walk_joints.yaml").read_bytes().decode("utf-8")
+
+
+# ASF and AMC
+
+
+@pytest.mark.parametrize("said", ["radians", "degrees"])
+def test_an_angle_that_two_files_have_in_other_units_is_refused(said, tmp_path):
+    (tmp_path / "a.asf").write_text(ASF if said == "radians" else ASF.replace("angle deg", "angle rad"))
+    (tmp_path / "a.amc").write_text(AMC.replace(":DEGREES", f":{said.upper()}"))
+    with pytest.raises(ValueError, match=rf"a\.amc, line \d: :{said.upper()}, but its skeleton is in"):
+        asf_amc.read_amc(tmp_path / "a.amc", asf_amc.read_asf(tmp_path / "a.asf"))
+    with pytest.raises(ValueError, match=r"a\.amc, line \d+: no complete :hierarchy .no bones: no ASF file"):
+        asf_amc.read_asf(tmp_path / "a.amc")
+    (tmp_path / "a.asf").write_text(ASF)
+    with pytest.raises(ValueError, match=r"a\.amc: --source-fps 1: give"):
+        asf_amc.read_amc(tmp_path / "a.amc", asf_amc.read_asf(tmp_path / "a.asf"), 1.0)
+
+
 # AMASS
 
 
@@ -439,6 +640,67 @@ def test_what_is_no_axis_angle_is_refused(poses, tmp_path):
     for other in (unclear, unclear.reshape(60, -1), matrices[:, :, :2], 2 * matrices, poses[:, :20]):
         with pytest.raises(ValueError, match=r"walk\.npz: poses"):
             amass.read_amass(recording(tmp_path, other))
+
+
+@pytest.mark.parametrize("kind", ["flat matrices", "quaternions", "6D", "longer quaternions", "noisy 6D"])
+def test_only_the_joints_of_the_body_show_what_poses_are(kind, bent, tmp_path):
+    """Hands without rotations, lengths that are not 1, and noise as of a network."""
+    turns = Rotation.from_rotvec(bent.reshape(-1, 3))
+    matrices, noise = turns.as_matrix().reshape(60, 22, 3, 3), np.random.default_rng(0).normal(size=(60, 22, 6))
+    six, fours = matrices[..., :2].reshape(60, 22, 6), turns.as_quat().reshape(60, 22, 4)
+
+    def with_hands(x):
+        return np.concatenate([x, np.zeros((60, 2, x.shape[-1]))], axis=1).reshape(60, -1)
+
+    other = {
+        "flat matrices": matrices.reshape(60, -1),
+        "quaternions": with_hands(fours),
+        "6D": with_hands(six),
+        "longer quaternions": with_hands(1.05 * fours),
+        "noisy 6D": (six + 0.01 * noise).reshape(60, -1),
+    }[kind]
+    wanted, found = (amass.read_amass(recording(tmp_path, each)).rotations for each in (bent, other))
+    np.testing.assert_allclose(found, wanted, atol=0.08 if "noisy" in kind else 1e-6)
+    np.testing.assert_allclose(np.linalg.det(found), 1, atol=1e-6)
+
+
+def test_what_turns_no_body_so_is_refused(bent, tmp_path):
+    taken = take("walk", 0, 30)
+    at = [taken.names.index(CMU_FROM_SMPL[name]) for name in BODY]
+    places = joints("walk", 0, 30)[:60, at]
+    with pytest.raises(ValueError, match=r"walk\.npz: poses .* are where joints are"):
+        amass.read_amass(recording(tmp_path, places - places[:, :1]))
+    world = bent.copy()
+    world[:, 1:] = world[:, :1]  # each turned as the pelvis, upright in z
+    with pytest.raises(ValueError, match=r"walk\.npz: poses .* are no rotations of a known kind: .*spine1.*--allow"):
+        amass.read_amass(recording(tmp_path, world))
+    amass.read_amass(recording(tmp_path, world), allow=True)
+    fours = Rotation.from_rotvec(bent.reshape(-1, 3)).as_quat().reshape(60, 22, 4)
+    fours[7, 4] = 0
+    with pytest.raises(ValueError, match=r"walk\.npz: poses of frame 7, left_knee, are no rotation"):
+        amass.read_amass(recording(tmp_path, fours))
+
+
+@pytest.mark.parametrize(
+    "rates, told",
+    [({"mocap_framerate": 1 / 120}, "not a rate in Hz"), ({"mocap_framerate": 1.0}, "not a rate in Hz"),
+     ({"mocap_framerate": 30.0, "fps": 60.0}, r"mocap_framerate, fps has 2 rates, as \[30\.0, 60\.0\]"),
+     ({"mocap_framerate": np.arange(60.0)}, "has 60 rates")],
+)  # fmt: skip
+def test_rates_that_are_none_or_differ_are_refused(rates, told, poses, tmp_path):
+    with pytest.raises(ValueError, match=rf"walk\.npz: .*{told}"):
+        amass.read_amass(recording(tmp_path, poses, **rates))
+    assert amass.read_amass(recording(tmp_path, poses, mocap_framerate=np.full(60, 30.0))).fps == 30
+
+
+def test_files_without_frames_or_of_another_kind_are_refused(poses, tmp_path):
+    for count in (0, 1):
+        path = recording(tmp_path, poses[:count], trans=np.zeros((count, 3)))
+        with pytest.raises(ValueError, match=rf"walk\.npz: a motion has two frames at least, not {count}"):
+            amass.read_amass(path)
+    np.save(tmp_path / "motion.npy", poses)
+    with pytest.raises(ValueError, match=r"motion\.npy: not a motion of AMASS: an \.npz file of poses"):
+        amass.read_amass(tmp_path / "motion.npy")
 
 
 def test_centimetres_are_noticed(poses, tmp_path):

@@ -1,6 +1,7 @@
 """Bodies of the SMPL family and motions of AMASS, written here in the layout that they are published in."""
 
 import collections
+import gzip
 import pickle
 import sys
 import types
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import trimesh
-from samples import PARENTS, recording
+from samples import PARENTS, recording, smpl_regressor
 from scipy.spatial.transform import Rotation
 
 from clothjax.body import plausibility, skinning
@@ -25,9 +26,6 @@ def model():
     mesh = trimesh.creation.icosphere(subdivisions=3)
     vertices = np.asarray(mesh.vertices) * [0.5, 0.85, 0.2]
     count = len(vertices)
-    regressor = np.zeros((24, count))
-    for row in regressor:
-        row[rng.choice(count, 5, replace=False)] = 0.2
     weights = np.zeros((count, 24))
     weights[np.arange(count)[:, None], rng.integers(0, 24, (count, 4))] = 1.0
     table = np.array([PARENTS, range(24)])
@@ -38,7 +36,7 @@ def model():
         "weights": weights / weights.sum(axis=1, keepdims=True),
         "shapedirs": 0.01 * rng.normal(size=(count, 3, 12)),
         "posedirs": 0.01 * rng.normal(size=(count, 3, 207)),
-        "J_regressor": scipy.sparse.csc_matrix(regressor),
+        "J_regressor": smpl_regressor(vertices),
         "kintree_table": table,
         "bs_type": "lrotmin",
     }
@@ -185,6 +183,37 @@ def test_what_is_wrong_with_a_body_is_said(key, value, said, model, tmp_path):
     np.savez(tmp_path / "model.npz", **{k: v for k, v in wrong.items() if v is not None})
     with pytest.raises(ValueError, match=rf"model\.npz: .*{said}"):
         smpl.body(tmp_path / "model.npz")
+
+
+HALF = np.diag([-1.0, 1, -1])
+Z_UP = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda model: {"v_template": 100 * model["v_template"]}, "it is 170 tall, which is not in m: scale"),
+        (lambda model: {"v_template": model["v_template"] @ Z_UP.T}, "its head is not above its pelvis along .y: turn"),
+        (lambda model: {"v_template": model["v_template"] @ HALF}, "it faces -z: turn"),
+        (lambda model: {"v_template": model["v_template"] * [-1, 1, 1]}, "its left is not at .x.*: it is mirrored"),
+        (lambda model: {"f": model["f"][:, ::-1]}, "its faces are seen from inside: turn each around"),
+        (lambda model: {"J_regressor": 2 * model["J_regressor"]}, "joint .*is outside of v_template"),
+        (lambda model: {"weights": 2 * model["weights"]}, "weights of vertex .* sum to 2.*sum to 1"),
+        (lambda model: {"weights": model["weights"] - 0.05}, "weights of vertex .* the least is -0.05"),
+    ],
+)
+def test_what_is_no_body_in_our_axes_and_metres_is_not_written(change, said, model, tmp_path):
+    model = model | {"J_regressor": model["J_regressor"].toarray()}
+    np.savez(tmp_path / "model.npz", **(model | change(model)))
+    with pytest.raises(ValueError, match=rf"model\.npz: {said}"):
+        smpl.main(smpl.Arguments(tmp_path / "model.npz", tmp_path / "body.h5"))
+    assert not (tmp_path / "body.h5").exists()
+
+
+def test_a_packed_model_is_refused(model, tmp_path):
+    (tmp_path / "model.pkl").write_bytes(gzip.compress(pickle.dumps(model)))
+    with pytest.raises(ValueError, match=r"model\.pkl: .*it is packed by gzip: unpack it"):
+        smpl.body(tmp_path / "model.pkl")
 
 
 # Motion

@@ -444,9 +444,10 @@ def test_what_is_far_too_small_is_not_asked_for_the_flags_in_use(skirt, body, na
         bring(save(0.05 * vertices, faces), body, names, Answers())
 
 
-def test_the_body_in_the_object_of_the_garment_is_refused(skirt, body, names, save):
+def test_the_body_in_the_object_of_the_garment_is_refused(body, names, save):
     figure = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
-    both = np.concatenate([figure[0], skirt[0]]), np.concatenate([figure[1], skirt[1] + len(figure[0])])
+    fine = storage.load_garment("skirt_4000", body)  # of more vertices than the body
+    both = np.concatenate([figure[0], fine.vertices]), np.concatenate([figure[1], fine.faces + len(figure[0])])
     for mesh in (figure, both):
         with pytest.raises(ValueError, match=r"it holds the body itself.*delete it from the file"):
             bring(save(*mesh), body, names, Answers())
