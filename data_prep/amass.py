@@ -27,7 +27,7 @@ from clothjax.progress import progress_bar
 from clothjax.types import Motion
 from data_prep import doubts, skeleton
 from data_prep.program import METRES, Axis, MotionOptions, Unit, run, write_motion
-from data_prep.recording import FASTEST, SLOWEST, Capture, resample
+from data_prep.recording import LEAST_RATE, MOST_RATE, Capture, resample
 from data_prep.rest_pose import AXES, UPRIGHT, turn_upright
 from data_prep.retarget import FROZEN, from_t_pose, leg_length, stand
 from data_prep.skeleton import cmu_names
@@ -132,9 +132,9 @@ def _arrays(path: str | Path) -> tuple[np.ndarray, np.ndarray, float]:
             f"{path}: {', '.join(rated)} has {len(rates)} rates, as {rates[:3].tolist()}: leave the right one"
         )
     (fps,) = rates.tolist()
-    if not SLOWEST <= fps <= FASTEST:
+    if not LEAST_RATE <= fps <= MOST_RATE:
         raise ValueError(
-            f"{path}: {', '.join(rated)} is {fps:g}, not a rate in Hz: {SLOWEST:g} to {FASTEST:g} are expected"
+            f"{path}: {', '.join(rated)} is {fps:g}, not a rate in Hz: {LEAST_RATE:g} to {MOST_RATE:g} are expected"
         )
     return poses, trans, fps
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from clothjax.files.storage import load_rig
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.recording import FASTEST, SLOWEST, Capture, numbers, read_lines
+from data_prep.recording import LEAST_RATE, MOST_RATE, Capture, numbers, read_lines
 
 CMU_NAMES = {
     "root": "Hips",
@@ -114,8 +114,10 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
     Raises:
         ValueError: naming file and line.
     """
-    if not SLOWEST <= fps <= FASTEST:
-        raise ValueError(f"{path}: --source-fps {fps:g}: give its frames a second, from {SLOWEST:g} to {FASTEST:g}")
+    if not LEAST_RATE <= fps <= MOST_RATE:
+        raise ValueError(
+            f"{path}: --source-fps {fps:g}: give its frames a second, from {LEAST_RATE:g} to {MOST_RATE:g}"
+        )
     names = ["root", *skeleton.parents]
     width = {name: len(bone.freedoms) for name, bone in skeleton.bones.items() if bone.freedoms} | {"root": 6}
     values: dict[str, list[list[float]]] = {name: [] for name in width}

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.files.storage import load_rig
 from data_prep import skeleton
 from data_prep.program import SkeletonOptions, retarget_as_asked, run, write_motion
-from data_prep.recording import FASTEST, SLOWEST, Capture, numbers, read_lines
+from data_prep.recording import LEAST_RATE, MOST_RATE, Capture, numbers, read_lines
 from data_prep.rest_pose import figure
 from data_prep.skeleton import cmu_names
 
@@ -49,7 +49,7 @@ def read_bvh(path: str | Path, tell: Callable[[str], object] = str, joints: Path
     (duration,) = numbers(path, line, words[2:], 1)
     if frames < 1 or duration <= 0:
         raise ValueError(f"{path}, line {line}: {frames} frames of {duration} s: both must be > 0")
-    if not SLOWEST <= 1 / duration <= FASTEST:
+    if not LEAST_RATE <= 1 / duration <= MOST_RATE:
         raise ValueError(
             f"{path}, line {line}: a Frame Time of {duration:g} would be {1 / duration:.3g} frames a second: it is in "
             f"seconds, such as {1 / 30:.4f}"

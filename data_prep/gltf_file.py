@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from clothjax.files.damage import UNREADABLE
-from data_prep.recording import SLOWEST
+from data_prep.recording import LEAST_RATE
 
 DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -249,7 +249,7 @@ def _check_keys(document: Document, moves: dict[tuple[int, str], tuple]) -> None
             raise ValueError(f"the rotation of {name} is no rotation at key {still[0]}: it is 0 0 0 0")
     keys = max((keys for keys, *_ in moves.values()), key=len)
     apart = np.diff(keys)
-    if len(keys) >= SAMPLED and apart.min() > max(1 / SLOWEST, 0.9 * apart.max()):
+    if len(keys) >= SAMPLED and apart.min() > max(1 / LEAST_RATE, 0.9 * apart.max()):
         raise ValueError(
             f"its {len(keys)} keys are {apart[0]:.3g} s apart: are its times in seconds? Export it at 30 a second"
         )

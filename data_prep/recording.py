@@ -10,9 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-SLOWEST, FASTEST = 5.0, 2000.0  # frames a second of a recording
-
-
+LEAST_RATE, MOST_RATE = 5.0, 2000.0  # frames a second of a recording
 GZIP = b"\x1f\x8b"
 OTHERS = {  # by how they begin
     b"glTF": "a glTF file: data_prep.gltf_motion reads it",
