@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from clothjax.geometry.topology import components
 from clothjax.types import Body
 from data_prep.dressing import CLEARANCE, WINDING
+from data_prep.mesh import edge_table
 from data_prep.mesh_file import Mesh
 from data_prep.program import METRES, Axis, Unit
 from data_prep.rest_pose import AXES, turn_upright
@@ -24,6 +25,7 @@ ALIKE = 2.0  # times the least cost, up to which places fit alike
 ON_BODY = 0.003  # m, from the body, of an object that is the body
 COVERED = 0.9  # of the body's vertices, that are on an object which is the body
 FLAT, WELDED = 1e-3, 1e-4  # of a mesh's size: from its plane, of a part that is flat; between vertices at one place
+PANEL, UNBENT = 0.15, 0.99999  # of a mesh's area, of a panel among joined ones; cosine across its edges
 MOSTLY = 0.5  # of a mesh's area, that is flat in a pattern before it is draped
 BELOW = 0.02  # m, below the soles
 AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
@@ -113,25 +115,43 @@ def check_objects(path: str | Path, mesh: Mesh, placed: np.ndarray, surface: Sur
 
 
 def check_draped(path: str | Path, mesh: Mesh, allow: bool) -> None:
-    """Refuse a sewing pattern: panels that are flat, before they were sewn and draped.
+    """Refuse a sewing pattern: panels that are flat, before they were sewn and draped, also if walls join them.
 
     Raises:
         ValueError: naming the file, and what to give in its place.
     """
     size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-9)
     places, welded = np.unique(np.round(mesh.vertices / (WELDED * size)), axis=0, return_inverse=True)
-    part = components(len(places), welded[mesh.faces])[welded[mesh.faces[:, 0]]]
-    area, flat = igl.doublearea(mesh.vertices, mesh.faces), 0.0
-    for number in np.unique(part):
-        points = mesh.vertices[np.unique(mesh.faces[part == number])]
-        around = points - points.mean(axis=0)
-        if len(points) > 3 and np.abs(around @ np.linalg.svd(around, full_matrices=False)[2][2]).max() < FLAT * size:
-            flat += area[part == number].sum()
-    if flat > MOSTLY * area.sum() and not allow:
+    faces = welded[mesh.faces]
+    part, area = components(len(places), faces)[faces[:, 0]], igl.doublearea(mesh.vertices, mesh.faces)
+    flat = np.isin(
+        part, [number for number in np.unique(part) if _flat(mesh.vertices[mesh.faces[part == number]], size)]
+    )
+    panel = _smooth(mesh.vertices, mesh.faces, edge_table(faces)[1])
+    flat |= (np.bincount(panel, area) > PANEL * area.sum())[panel]
+    share = area[flat].sum() / max(area.sum(), 1e-30)
+    if share > MOSTLY and not allow:
         raise ValueError(
-            f"{path}: {100 * flat / area.sum():.0f} % of it lies in flat parts, as a sewing pattern does before it is "
-            "sewn and draped: give the draped mesh (of GarmentCode NAME_sim.obj); --allow takes it as it is"
+            f"{path}: {100 * share:.0f} % of it lies in flat parts, as a sewing pattern does before it is sewn and "
+            "draped: give the draped mesh (of GarmentCode NAME_sim.obj); --allow takes it as it is"
         )
+
+
+def _flat(corners: np.ndarray, size: float) -> bool:
+    """Return whether more than one face, of corners [F, 3, 3], lies in a plane, of a mesh of that size."""
+    points = corners.reshape(-1, 3) - corners.mean(axis=(0, 1))
+    return len(corners) > 1 and np.abs(points @ np.linalg.svd(points, full_matrices=False)[2][2]).max() < FLAT * size
+
+
+def _smooth(vertices: np.ndarray, faces: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return for each face [F] the number of its panel: what hangs together across edges [F, 3] without a bend."""
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    order = np.argsort(edges.reshape(-1), kind="stable")
+    same = np.flatnonzero(np.diff(edges.reshape(-1)[order]) == 0)
+    pairs = np.stack([order[same], order[same + 1]], axis=1) // 3
+    return components(len(faces), pairs[np.abs((normal[pairs[:, 0]] * normal[pairs[:, 1]]).sum(axis=1)) > UNBENT])
 
 
 def better_place(vertices: np.ndarray, surface: Surface, place: Placement) -> str:

@@ -464,6 +464,13 @@ def test_panels_that_lie_flat_are_refused(skirt, body, names, save):
         both = np.concatenate([panel - np.multiply(0.5, move), panel + np.multiply(0.5, move)])
         with pytest.raises(ValueError, match=r"skirt\.obj: 100 % of it lies in flat parts, as a sewing pattern"):
             bring(save(both, np.concatenate([faces, faces + 400])), body, names, Answers())
+    edge = np.concatenate([at[0], at[-1]])  # of both panels, joined by walls
+    walls = np.stack([edge[:-1], edge[1:], edge[1:] + 400], 1)
+    walls = walls[np.abs(np.diff(walls[:, :2], axis=1))[:, 0] == 1]
+    walls = np.concatenate([walls, np.stack([walls[:, 0], walls[:, 2], walls[:, 0] + 400], 1)])
+    box = np.concatenate([panel - [0, 0, 0.2], panel + [0, 0, 0.2]])
+    with pytest.raises(ValueError, match=r"skirt\.obj: 100 % of it lies in flat parts"):
+        bring(save(box, np.concatenate([faces, faces + 400, walls])), body, names, Answers(pin="highest"))
     with_patch = np.concatenate([skirt[0], 0.1 * panel + [0, 0, 0.25]])  # a label on a skirt
     bring(save(with_patch, np.concatenate([skirt[1], faces + len(skirt[0])])), body, names, Answers(loose=False))
 
