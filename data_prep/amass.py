@@ -44,6 +44,7 @@ BONES = tuple(
     for start, end in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 )
 MOVED, RIGID = 0.05, 0.02  # m that bones move, and the share of their lengths by which these change, of positions
+STANDING = (0.5, 1.5)  # m, of the pelvis of a figure that stands, or jumps, above the ground at zero
 HIGHEST = 10.0  # m, of a pelvis whose path is in metres
 LARGEST = 4 * np.pi  # rad, of a turn that is not in degrees
 BENT = 0.1  # rad, of knees or elbows on average, that show which way these bend ...
@@ -88,7 +89,13 @@ def read_amass(
     stands = rotations[:, 0, :, 1].mean(axis=0)  # SMPL's pelvis has +y up
     seen = max(AXES, key=lambda axis: float(stands @ AXES[axis]))
     seen = seen if stands @ AXES[seen] > UPRIGHT else None
-    if up is not None and seen not in (None, up) and not allow:
+    lies = seen not in (None, "z") and not STANDING[0] < float(np.median(trans @ AXES[seen])) < STANDING[1]
+    if lies and up is None:
+        raise ValueError(
+            f"{path}: its pelvis stands along {seen}, but is not as high there: give --up z if the figure lies or "
+            f"crawls, --up {seen} if it stands"
+        )
+    if up is not None and seen not in (None, up) and not (allow or lies):
         raise ValueError(f"{path}: --up {up}, but its figure stands along {seen}; --allow takes it all the same")
     if up is None and seen not in (None, "z"):
         tell(f"{seen} is up, for the figure stands along it; --up says otherwise")

@@ -28,7 +28,9 @@ FLAT, WELDED = 1e-3, 1e-4  # of a mesh's size: from its plane, of a part that is
 PANEL, UNBENT = 0.15, 0.99999  # of a mesh's area, of a panel among joined ones; cosine across its edges
 MOSTLY = 0.5  # of a mesh's area, that is flat in a pattern before it is draped
 BELOW = 0.02  # m, below the soles
-AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
+AROUND = 0.5  # winding number of a garment about a point of the body that it goes around
+OUTSIDE = 0.002  # m, mean depth inside the body, of what fits it
+CLOSE, NEARER = 0.05, 0.5  # m, from the body, of what is small; times its distance, of what fits better elsewhere
 UPRIGHT = ("y", "z")  # axes that point up in programs
 SAMPLE = 500  # vertices that stand for all
 
@@ -47,13 +49,21 @@ class Placement(NamedTuple):
         return METRES[self.units] * vertices @ TO_Y_UP[self.up].T @ turn.T + np.array(self.shift)
 
 
-def check_place(path: str | Path, vertices: np.ndarray, surface: Surface, place: Placement) -> None:
+def check_place(path: str | Path, mesh: Mesh, body: Body, surface: Surface, place: Placement) -> None:
     """Refuse a mesh that is not around the body in the user's units and axis, and name those in which it is.
+
+    Args:
+        path: of the mesh.
+        mesh: as read.
+        body: that it is worn on.
+        surface: of the body.
+        place: of the user.
 
     Raises:
         ValueError: naming the file, and the units and axis in which it would be.
     """
-    height, sample = np.ptp(surface[0][:, 1]), vertices[:: max(1, len(vertices) // SAMPLE)]
+    vertices, height = mesh.vertices, np.ptp(surface[0][:, 1])
+    sample = vertices[:: max(1, len(vertices) // SAMPLE)]
     soles = (0.0, float(surface[0][:, 1].min()), 0.0)
     places = [place]
     for units, scale in METRES.items():
@@ -67,6 +77,10 @@ def check_place(path: str | Path, vertices: np.ndarray, surface: Surface, place:
     distance, depth = _fit(sample, surface, places)
     cost = np.where(distance < MAX_MEAN_DISTANCE, distance + INSIDE_PENALTY * depth, np.inf)
     large = 0.05 * height < METRES[place.units] * np.ptp(vertices, axis=0).max() < 1.5 * height
+    fits = depth < OUTSIDE  # such as a gown, which is far from the body, and a band around a wrist
+    wide = fits[0] and goes_around(place(vertices), mesh.faces, body)
+    if wide and (large or distance[0] < CLOSE) and not (distance[fits] < NEARER * distance[0]).any():
+        return
     if not large:
         cost[[it.units == place.units for it in places]] = np.inf
     if cost[0] < np.inf and cost[0] <= 2 * cost.min() + 0.01:
@@ -130,7 +144,8 @@ def check_draped(path: str | Path, mesh: Mesh, allow: bool) -> None:
     panel = _smooth(mesh.vertices, mesh.faces, edge_table(faces)[1])
     flat |= (np.bincount(panel, area) > PANEL * area.sum())[panel]
     share = area[flat].sum() / max(area.sum(), 1e-30)
-    if share > MOSTLY and not allow:
+    several = len(np.unique(panel[flat])) > 1  # one may be a cape
+    if share > MOSTLY and several and not allow:
         raise ValueError(
             f"{path}: {100 * share:.0f} % of it lies in flat parts, as a sewing pattern does before it is sewn and "
             "draped: give the draped mesh (of GarmentCode NAME_sim.obj); --allow takes it as it is"
@@ -203,12 +218,20 @@ def _fit(
     return np.abs(signed).mean(axis=1), np.maximum(clearance - signed, 0.0).mean(axis=1)
 
 
+def goes_around(vertices: np.ndarray, faces: np.ndarray, body: Body) -> bool:
+    """Return whether a mesh [V, 3] m goes around any part of the body: around a point of a bone, or beyond its end."""
+    joints, parents = np.asarray(body.joints, np.float64), np.asarray(body.parents)
+    ends, starts = joints[parents >= 0], joints[parents[parents >= 0]]
+    points = np.concatenate([starts + share * (ends - starts) for share in np.arange(0.0, 2.0, 0.25)])
+    around = igl.fast_winding_number(vertices, faces, points)
+    return bool(np.abs(around).max() > AROUND)
+
+
 def worn(vertices: np.ndarray, faces: np.ndarray, body: Body) -> str:
     """Say where a garment [V, 3] m is worn, and whether it goes around any part of the body."""
     low, high = vertices[:, 1].min(), vertices[:, 1].max()
     soles = np.asarray(body.vertices)[:, 1].min()
-    around = np.abs(igl.fast_winding_number(vertices, faces, np.asarray(body.joints, np.float64)))
-    doubts = ["it goes around no part of the body"] * bool(around.max() < AROUND)
+    doubts = ["it goes around no part of the body"] * (not goes_around(vertices, faces, body))
     doubts += ["it reaches below the soles"] * bool(low < soles - BELOW)
     said = f"worn from {low - soles:.2f} to {high - soles:.2f} m above the soles, at {low:.2f} to {high:.2f} m"
     return f"{said}, but {' and '.join(doubts)}: is it worn elsewhere?" if doubts else said

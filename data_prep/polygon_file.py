@@ -15,7 +15,7 @@ from data_prep.recording import read_lines
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
+    "double": "f8", "float64": "f8", "int64": "i8", "uint64": "u8",
 }  # fmt: skip
 LINE = 1e-6  # of a polygon's area, of a triangle that is a line
 INDICES = ("vertex_indices", "vertex_index")  # of a face of a PLY file
@@ -92,7 +92,7 @@ def _obj(path: Path) -> Polygons:
     """Read an OBJ file. Programs such as Maya and Marvelous Designer write parts as groups, others as objects."""
     vertices, colours, groups = [], [], {}
     counts, current = {"v": 0, "vt": 0, "vn": 0}, {"o": (), "g": (), "usemtl": ()}
-    for number, words in _joined(read_lines(path)):
+    for number, words in _joined(_bare(path)):
         key, rest = words[0], words[1:]
         if key in counts:
             counts[key] += 1
@@ -113,6 +113,14 @@ def _obj(path: Path) -> Polygons:
     if not len(known):
         return Polygons(np.array(vertices).reshape(-1, 3), None, groups)
     return Polygons(np.array(vertices), painted * (255.0 if known.max() <= 1.0 else 1.0), groups)
+
+
+def _bare(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and words of the lines of a text, without comments."""
+    for number, words in read_lines(path):
+        end = next((k for k, word in enumerate(words) if word.startswith("#")), len(words))
+        if end:
+            yield number, words[:end]
 
 
 def _joined(lines: Iterable[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
@@ -150,15 +158,16 @@ def _numbers(number: int, words: list[str]) -> list[float]:
 
 def _off(path: Path) -> Polygons:
     """Read an OFF file, also with normals or colours of its vertices."""
-    rows = [(number, words) for number, words in read_lines(path) if not words[0].startswith("#")]
+    rows = list(_bare(path))
     kind = ""
     if rows and "OFF" in rows[0][1][0].upper():
         number, words = rows[0]
         kind = words[0].upper().partition("OFF")[0]
         rows[:1] = [(number, words[1:])] if len(words) > 1 else []
-    if not rows:
-        raise ValueError("an empty file: copy or download it again")
-    points, faces = (int(x) for x in _numbers(*rows[0])[:2])
+    counts = rows[0][1] if rows else []
+    if len(counts) < 2 or not all(word.isdigit() for word in counts):
+        raise ValueError("it does not say how many vertices and faces it has, as a text does: export it as text")
+    points, faces = (int(word) for word in counts[:2])
     rows = rows[1:]
     if len(rows) < points + faces:
         raise ValueError(f"it is cut short: {len(rows)} lines for {points} vertices and {faces} faces")
@@ -171,7 +180,7 @@ def _off(path: Path) -> Polygons:
     polygons = []
     for number, words in rows[points : points + faces]:
         count = int(words[0]) if words[0].isdigit() else 0
-        if not 3 <= count < len(words):
+        if not 0 < count < len(words):
             raise ValueError(f"line {number}: {' '.join(words)!r} is no face")
         polygons.append([int(word) for word in words[1 : count + 1]])
     return Polygons(np.array([own[:3] for own in values]).reshape(-1, 3), colours, {(): polygons})
@@ -205,6 +214,8 @@ def _ply(path: Path) -> Polygons:
                 except EOFError:
                     raise ValueError(f"it is cut short: {name} {number} of {element.count}") from None
     vertex, face = columns.get("vertex", {}), columns.get("face", {})
+    if not {"x", "y", "z"} <= vertex.keys():
+        raise ValueError("its vertices have no x, y and z: export it again")
     vertices = np.stack([np.array(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     corners = next((face[name] for name in INDICES if name in face), [])
     colours = None
@@ -228,9 +239,13 @@ def _ply_header(data: bytes) -> tuple[str, dict[str, _Element], bytes]:
             elements[words[1]] = _Element(int(words[2]), {}, {})
         elif words[:1] == ["property"]:
             element = list(elements.values())[-1]
-            element.scalars[words[-1]] = PLY_TYPES[words[2 if words[1] == "list" else 1]]
+            kinds = words[2:4] if words[1] == "list" else words[1:2]
+            unknown = [kind for kind in kinds if kind not in PLY_TYPES]
+            if unknown:
+                raise ValueError(f"numbers of type {unknown[0]}, which PLY has not: export it again")
+            element.scalars[words[-1]] = PLY_TYPES[kinds[0]]
             if words[1] == "list":
-                element.lists[words[-1]] = PLY_TYPES[words[3]]
+                element.lists[words[-1]] = PLY_TYPES[kinds[1]]
     if "tristrips" in elements:
         raise ValueError("strips of triangles: export it as triangles")
     if kind not in ("ascii", "binary_little_endian", "binary_big_endian"):

@@ -185,7 +185,13 @@ def _up(
         raise ValueError(f"{about}: it does not show which way is up: give --up y or --up z")
     if axes.forward is not None and axes.forward[-1] == up[-1]:
         raise ValueError(f"{about}: {up} is up, so --forward {axes.forward} cannot be forward")
-    if seen not in (None, up) and not allow:
+    lies = None not in (rest, seen) and rest != seen and rest_pose.may_lie(shown, parts, AXES[seen], AXES[rest])
+    if lies and axes.up is None:
+        raise ValueError(
+            f"{about}: its figure is upright along {seen}, but its rest pose has {rest} up: give --up {rest} if it "
+            f"lies or crawls, --up {seen} if it stands"
+        )
+    if seen not in (None, up) and not (allow or (lies and up == rest)):
         raise ValueError(f"{about}: --up {up}, but its figure stands along {seen}; --allow takes it all the same")
     if axes.up is None and up != "y":
         tell(f"{up} is up, for the figure stands along it; --up says otherwise")

@@ -13,6 +13,8 @@ WELD_DISTANCE = 1e-4  # m; closer vertices become one
 BESIDE, MAYBE_BESIDE = 0.002, 0.005  # m, between the sides of a seam that is not sewn; of one that may be meant
 LEAST_BESIDE = 0.05  # m, for which they must run so
 NEIGHBOUR = 0.02  # m along a border, within which it is beside itself at any rate
+HOLE = 0.1  # m, of a border that is a hole or a slit; it is not beside others
+NARROW = 0.2  # of its length, of a slit
 SPACING = 2.5e-4  # m, between the points of a border that are compared
 
 
@@ -116,17 +118,16 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, dista
     points, along = (np.concatenate(parts) for parts in zip(*loops, strict=True))
     number = np.concatenate([np.full(len(own), k) for k, (_, own) in enumerate(loops)])
     pairs = cKDTree(points).query_pairs(MAYBE_BESIDE, output_type="ndarray")
+    lengths = np.array([own[-1] for _, own in loops])
     a, b = pairs.T
-    whole = np.array([own[-1] for _, own in loops])[number[a]]
     onward = np.abs(along[a] - along[b])
-    pairs = pairs[(number[a] != number[b]) | (np.minimum(onward, whole - onward) > NEIGHBOUR)]
+    apart_along = np.minimum(onward, lengths[number[a]] - onward)
+    longer = np.minimum(lengths[number[a]], lengths[number[b]]) > HOLE
+    pairs = pairs[longer & ((number[a] != number[b]) | (apart_along > NEIGHBOUR))]
     apart = np.full(len(points), np.inf)
     between = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     for side in pairs.T:
         np.minimum.at(apart, side, between)
-    for k, (own, _) in enumerate(loops):  # of a slit both sides are near along it
-        width = 2 * np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1] / len(own) ** 0.5
-        apart[number == k] = np.minimum(apart[number == k], width)
     for reach in (BESIDE, MAYBE_BESIDE):
         beside = apart < reach
         if SPACING * beside.sum() > LEAST_BESIDE:
@@ -136,7 +137,17 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, dista
             if reach == MAYBE_BESIDE or allow:
                 return [f"{said}, and stay open; {sews} them"]
             raise ValueError(f"{path}: {said}: a seam that is not sewn? {sews} it, --allow leaves it open")
+    slits = [own for own, _ in loops if _width(own) < BESIDE]
+    if SPACING * sum(map(len, slits)) > LEAST_BESIDE:
+        wide = 1e3 * max(map(_width, slits))
+        return [f"{len(slits)} slits are up to {wide:.1f} mm wide, as at {np.round(slits[0][0], 2)} m, and stay open"]
     return []
+
+
+def _width(border: np.ndarray) -> float:
+    """Return the width in m of a border [n, 3] m that is a slit, inf for a hole."""
+    long, wide = 2 * np.linalg.svd(border - border.mean(axis=0), compute_uv=False)[:2] / len(border) ** 0.5
+    return float(wide) if wide < NARROW * long else np.inf
 
 
 def _borders(faces: np.ndarray) -> list[np.ndarray]:

@@ -43,6 +43,7 @@ KEYS = ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table
 
 
 LEFT = tuple(f"left_{part}" for part in ("hip", "knee", "ankle", "collar", "shoulder", "elbow", "wrist"))
+ALONG = 0.9  # cosine at least, between trunk or hips and the axis that they are along
 TALL, OUTSIDE = (0.3, 3.0), 0.1  # m; share of that, by which a joint may be outside of its mesh
 
 
@@ -229,7 +230,7 @@ def misplaced(body: Body) -> str:
     tall = high[1] - low[1]
     low, high = low - OUTSIDE * tall, high + OUTSIDE * tall
     trunk = at["head"] - at["pelvis"]
-    if np.abs(trunk).argmax() != 1 or trunk[1] < 0:
+    if trunk[1] < ALONG * np.linalg.norm(trunk):
         return "its head is not above its pelvis along +y: turn v_template and shapedirs"
     if not TALL[0] < tall < TALL[1]:
         return f"it is {tall:.3g} tall, which is not in m: scale v_template and shapedirs"
@@ -238,6 +239,9 @@ def misplaced(body: Body) -> str:
         return f"joint {outside}, of J_regressor, is outside of v_template: the two do not belong together"
     across = [at[left][0] - at[left.replace("left", "right")][0] for left in LEFT]
     ahead = np.mean([at[f"{side}_foot"][2] - at[f"{side}_ankle"][2] for side in ("left", "right")])
+    hips = at["left_hip"] - at["right_hip"]
+    if abs(hips[0]) < ALONG * np.linalg.norm(hips):
+        return "its hips are not along x: turn v_template and shapedirs about y, so that it faces +z"
     if max(across) < 0 and ahead < 0:
         return "it faces -z: turn v_template and shapedirs by half a turn about y"
     if min(across) < 0 or ahead < 0:

@@ -79,7 +79,7 @@ def bring(path: str | Path, body: Body, names: tuple[str, ...], answers: Answers
     mesh = _chosen(path, mesh_file.read(path), answers.objects)
     surface = np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int64)
     check_draped(path, mesh, answers.allow)
-    check_place(path, mesh.vertices, surface, answers.placement)
+    check_place(path, mesh, body, surface, answers.placement)
     placed = answers.placement(mesh.vertices)
     check_objects(path, mesh, placed, surface)
     working, index = _clean(path, placed, mesh.faces)

@@ -282,6 +282,28 @@ def test_an_obj_file_as_programs_write_it(encoding, tmp_path):
     assert mesh.vertices[mesh.red].tolist() == [[0, 0, 0]]
 
 
+@pytest.mark.parametrize("text", [
+    "OFF # a mesh\n4 2 # counts\n# points\n0 0 0\n1 0 0 # x\n1 1 0\n0 1 0\n3 0 1 2\n2 0 1\n",
+    "4 1 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2 255 0 0\n",
+])  # fmt: skip
+def test_off_files_as_programs_write_them(text, tmp_path):
+    (tmp_path / "a.off").write_text(text)
+    mesh = mesh_file.read(tmp_path / "a.off")
+    assert mesh.faces.shape == (1, 3) and area(mesh) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("suffix, text, told", [
+    (".off", "OFF BINARY\n\0\0", "export it as text"),
+    (".ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n0\n", "numbers of type half"),
+    (".ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float X\nend_header\n0\n", "no x, y and z"),
+    (".obj", "v 0 0 0 # here\nv 1 0 0\n# there \\\nv 0 1 0\nf 1 2 3 4 # four\n", "names vertex 4 of 3"),
+])  # fmt: skip
+def test_what_another_program_means_is_named(suffix, text, told, tmp_path):
+    (tmp_path / f"a{suffix}").write_text(text)
+    with pytest.raises(ValueError, match=rf"a\{suffix}: .*{told}"):
+        mesh_file.read(tmp_path / f"a{suffix}")
+
+
 @pytest.mark.parametrize("most", [1.0, 255])
 def test_colours_of_an_off_file(most, tmp_path):
     colours = [[most, 0, 0, most], [most, most, most, most], [0, 0, 0, most]]

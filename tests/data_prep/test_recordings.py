@@ -624,6 +624,35 @@ def test_an_axis_of_amass_that_figures_do_not_stand_along_is_refused(bent, tmp_p
     amass.read_amass(recording(tmp_path, bent), "y", allow=True)
 
 
+def test_one_that_lies_is_asked_about(bent, tmp_path):
+    """A body on its back is upright along a horizontal axis of the file; only its height tells."""
+    back = Rotation.from_euler("x", -90, degrees=True)
+    lying = bent.copy()
+    lying[:, 0] = (back * Rotation.from_rotvec(bent[:, 0])).as_rotvec()
+    path = recording(tmp_path, lying, trans=np.tile([0.3, 0.2, 0.12], (len(bent), 1)))
+    with pytest.raises(ValueError, match=r"walk\.npz: .*give --up z if the figure lies or crawls, --up -?[xy] if it"):
+        amass.read_amass(path)
+    found = amass.read_amass(path, "z").rotations
+    upright = found[:, 0, :, 1]
+    assert np.abs(upright[:, 1]).max() < 0.5  # +y is up in the result
+
+
+@pytest.mark.parametrize("path", [[0.0, 0.1, 0.0], [0.5, 0.15, 0.9]])
+def test_one_that_lies_in_a_file_with_a_t_pose_is_asked_about(path, rig, tmp_path):
+    lying = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    taken = take("walk", 3, 60)
+    rotations, places = taken.rotations.copy(), taken.places.copy()
+    rotations[:, 0], places[:, 0] = lying @ rotations[:, 0], np.array(path)
+    taken = taken._replace(rotations=rotations, places=places)
+    file = tmp_path / "walk.bvh"
+    write_bvh(file, taken, "0.0166667", ["zxy"] * len(taken.names))
+    with pytest.raises(ValueError, match=r"walk\.bvh: .*its rest pose has y up: give --up y if it lies or crawls"):
+        retargeted(file, rig)
+    found, _ = retargeted(file, rig, axes=retarget.Axes("y"))
+    head, hips = (found[:, rig.names.index(name)] for name in ("Head", "Hips"))
+    assert np.abs((head - hips)[:, 1]).max() < 0.2
+
+
 def test_a_file_with_y_up_shows_it(poses, tmp_path):
     wanted = amass.read_amass(recording(tmp_path, poses))
     turned = poses.copy()

@@ -187,6 +187,7 @@ def test_what_is_wrong_with_a_body_is_said(key, value, said, model, tmp_path):
 
 HALF = np.diag([-1.0, 1, -1])
 Z_UP = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+QUARTER, TILTED = (Rotation.from_euler(axis, 60, degrees=True).as_matrix() for axis in "yz")
 
 
 @pytest.mark.parametrize(
@@ -195,6 +196,11 @@ Z_UP = Rotation.from_euler("x", 90, degrees=True).as_matrix()
         (lambda model: {"v_template": 100 * model["v_template"]}, "it is 170 tall, which is not in m: scale"),
         (lambda model: {"v_template": model["v_template"] @ Z_UP.T}, "its head is not above its pelvis along .y: turn"),
         (lambda model: {"v_template": model["v_template"] @ HALF}, "it faces -z: turn"),
+        (lambda model: {"v_template": model["v_template"] @ QUARTER.T}, "its hips are not along x: turn"),
+        (
+            lambda model: {"v_template": model["v_template"] @ TILTED.T},
+            "its head is not above its pelvis along .y: turn",
+        ),
         (lambda model: {"v_template": model["v_template"] * [-1, 1, 1]}, "its left is not at .x.*: it is mirrored"),
         (lambda model: {"f": model["f"][:, ::-1]}, "its faces are seen from inside: turn each around"),
         (lambda model: {"J_regressor": 2 * model["J_regressor"]}, "joint .*is outside of v_template"),

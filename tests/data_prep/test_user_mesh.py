@@ -406,6 +406,21 @@ def test_a_file_with_the_body_in_it_asks_for_the_garment(skirt, body, names, tmp
         bring(tmp_path / "dressed.glb", body, names, Answers(objects=("hat",)))
 
 
+@pytest.mark.parametrize("hem", [0.6, 1.0])
+def test_a_gown_is_worn_though_its_hem_is_far_from_the_body(hem, body, names, save):
+    angle, rows = 2 * np.pi * np.arange(60) / 60, np.linspace(0, 1, 25)
+    radius = 0.24 + (hem - 0.24) * rows
+    points = np.stack([
+        radius[:, None] * np.cos(angle), np.broadcast_to(0.1 - 1.0 * rows[:, None], (25, 60)),
+        radius[:, None] * np.sin(angle),
+    ], axis=-1).reshape(-1, 3)  # fmt: skip
+    at = np.arange(25 * 60).reshape(25, 60)
+    a, b, c, d = at[:-1], np.roll(at[:-1], -1, 1), at[1:], np.roll(at[1:], -1, 1)
+    faces = np.stack([np.stack(corners, -1) for corners in ((a, b, d), (a, d, c))]).reshape(-1, 3)
+    made, _ = bring(save(points, faces), body, names, Answers(pin="highest", loose=False))
+    np.testing.assert_allclose(made.vertices, points, atol=2e-3)
+
+
 @pytest.mark.parametrize("wide, asked", [(1.0, False), (1.6, True)])
 def test_a_garment_far_from_the_body_is_asked_about(wide, asked, body, names, tmp_path):
     skirt = storage.load_garment("skirt_1000", body)
