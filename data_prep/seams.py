@@ -14,6 +14,7 @@ BESIDE, MAYBE_BESIDE = 0.002, 0.005  # m, between the sides of a seam that is no
 LEAST_BESIDE = 0.05  # m, for which they must run so
 NEIGHBOUR = 0.02  # m along a border, within which it is beside itself at any rate
 HOLE = 0.1  # m, of a border that is a hole or a slit; it is not beside others
+MEETING = 0.006  # m, around a vertex where borders meet
 NARROW = 0.2  # of its length, of a slit
 SPACING = 2.5e-4  # m, between the points of a border that are compared
 
@@ -128,6 +129,9 @@ def check_seams(path: str | Path, vertices: np.ndarray, faces: np.ndarray, dista
     between = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     for side in pairs.T:
         np.minimum.at(apart, side, between)
+    meeting, times = np.unique(np.concatenate(borders), return_counts=True)
+    if (times > 1).any():  # borders that meet at a vertex are near each other there
+        apart[cKDTree(vertices[meeting[times > 1]]).query(points)[0] < MEETING] = np.inf
     for reach in (BESIDE, MAYBE_BESIDE):
         beside = apart < reach
         if SPACING * beside.sum() > LEAST_BESIDE:
