@@ -18,7 +18,7 @@ STRAIGHT = 40.0  # degrees, by which trunk and legs of a rest pose may be off th
 TWISTED, KNEES = 10.0, 25.0  # degrees, by which shoulders may be off the hips, and knees bent, in a rest pose
 ALONG = 3.0  # degrees, by which a rest pose that faces along an axis may be off it
 BENT = 0.15  # least sine of the angle of a knee or elbow that shows its hinge
-LEVEL = 1 / 3  # of the height of a figure, by which its feet may be off the ground
+LEVEL, ANKLE = 1 / 3, 0.15  # of the height of a figure, by which its feet may be off the ground; by which they are
 LOW, MOST_LOW = 0.05, 0.5  # of that, from below the ground up to which one that lies reaches
 SEEN = 0.05  # share of the frames in which knees are bent, that shows which way they do
 
@@ -93,7 +93,8 @@ def may_lie(moving: Figure, parts: Parts, up: np.ndarray, rest: np.ndarray) -> b
     soles, along = (moving.positions[:, feet] @ up).min(axis=1), moving.positions[:, known] @ rest
     tall = np.median(np.abs(moving.positions[:, head] @ up - soles))
     low, high = np.median(along.min(axis=1)) / tall, np.median(along.max(axis=1)) / tall
-    return bool(np.median(np.abs(soles)) > LEVEL * tall or (low > -LOW and high < MOST_LOW))
+    off = np.median(np.abs(soles)) / tall
+    return bool(off > LEVEL or (off > ANKLE and low > -LOW and high < MOST_LOW))
 
 
 def sides(moving: Figure, parts: Parts) -> str:
