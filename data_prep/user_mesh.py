@@ -308,8 +308,8 @@ def _push_out(path: str | Path, working: Working, surface: Surface, in_file: np.
         place = np.round(points[signed.argmin()], 2)
         raise ValueError(
             f"{path}: {int((signed < 0).sum())} vertices cannot be pushed out of the body, the first at {place} m: "
-            f"{better_place(in_file, surface, answers.placement)}it was made for another body or another pose, or "
-            "these must be moved out of it"
+            f"{better_place(in_file, surface, answers.placement)}move them out of it, or "
+            "fit it to this body and its pose, if it was made for another"
         )
     moved = np.linalg.norm(cleared - points, axis=1)
     if moved.max() > FARTHEST_PUSH and not answers.allow:
