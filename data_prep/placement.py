@@ -28,7 +28,7 @@ FLAT, WELDED = 1e-3, 1e-4  # of a mesh's size: from its plane, of a part that is
 PANEL, UNBENT = 0.15, 0.99999  # of a mesh's area, of a panel among joined ones; cosine across its edges
 MOSTLY = 0.5  # of a mesh's area, that is flat in a pattern before it is draped
 BELOW = 0.02  # m, below the soles
-AROUND = 0.5  # winding number of a garment about a point of the body that it goes around
+AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
 OUTSIDE = 0.002  # m, mean depth inside the body, of what fits it
 CLOSE, NEARER = 0.05, 0.5  # m, from the body, of what is small; times its distance, of what fits better elsewhere
 UPRIGHT = ("y", "z")  # axes that point up in programs
@@ -219,11 +219,8 @@ def _fit(
 
 
 def goes_around(vertices: np.ndarray, faces: np.ndarray, body: Body) -> bool:
-    """Return whether a mesh [V, 3] m goes around any part of the body: around a point of a bone, or beyond its end."""
-    joints, parents = np.asarray(body.joints, np.float64), np.asarray(body.parents)
-    ends, starts = joints[parents >= 0], joints[parents[parents >= 0]]
-    points = np.concatenate([starts + share * (ends - starts) for share in np.arange(0.0, 2.0, 0.25)])
-    around = igl.fast_winding_number(vertices, faces, points)
+    """Return whether a mesh [V, 3] m goes around a joint of the body."""
+    around = igl.fast_winding_number(vertices, faces, np.asarray(body.joints, np.float64))
     return bool(np.abs(around).max() > AROUND)
 
 
