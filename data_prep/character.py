@@ -24,7 +24,7 @@ TALL = (1.0, 2.3)  # m, of a figure whose unit of length is looked for
 FARTHEST = 2.5  # m, of a vertex from the hips
 WELD = 1e-5  # m, within which vertices are one: files split them where textures and normals do
 MOST_FACES = 30_000  # of a body as it is; contact is sought on every one
-BENT = 1e-3  # of the height, by which a vertex may be elsewhere, as it was bound in another pose
+ELSEWHERE = 1e-3  # of the height, by which a vertex may be elsewhere, as it was bound in another pose
 MOVED = 0.005  # m, by which a morph target moves the trunk or a limb at least to be a shape of the body
 FULL = 3.0  # betas at which a morph target is taken in full
 
@@ -166,7 +166,7 @@ def _bound(document: Document, chosen: list[Part], joints: Path | None) -> tuple
         bent = max(bent, float(np.linalg.norm(vertices[-1] - plain, axis=1).max(initial=0.0)))
         weights.append(own)
         moves.append({name: np.einsum("vab,vb->va", turns, added) for name, added in part.morphs.items()})
-    if bent > BENT * np.ptp(np.concatenate(vertices), axis=0).max():
+    if bent > ELSEWHERE * np.ptp(np.concatenate(vertices), axis=0).max():
         log.append("an object was bound in another pose than the largest one: it is carried into that pose")
     if outside:
         log.append(f"{outside} vertices follow joints that do not hang on the hips: they follow the hips")

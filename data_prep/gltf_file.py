@@ -80,9 +80,7 @@ class Document:
         if not data:
             raise ValueError("an empty file: copy or download it again")
         if data[:4] == GLB:
-            version = int.from_bytes(data[4:8], "little")
-            if version != 2:
-                raise ValueError(f"glTF of version {version}, not 2: export it as glTF 2.0")
+            _check_version(str(int.from_bytes(data[4:8], "little")))
             at, chunks = 12, []
             while at + 8 <= len(data):
                 size = int.from_bytes(data[at : at + 4], "little")
@@ -91,9 +89,7 @@ class Document:
             data = next((chunk for kind, chunk in chunks if kind == b"JSON"), b"")
             self.binary = next((chunk for kind, chunk in chunks if kind == b"BIN\0"), b"")
         self.json: dict[str, Any] = json.loads(data)
-        version = str(self.json.get("asset", {}).get("version", "2.0"))
-        if not version.startswith("2"):
-            raise ValueError(f"glTF of version {version}: export it as glTF 2.0")
+        _check_version(str(self.json.get("asset", {}).get("version", "2.0")))
         needed = [name for name in self.json.get("extensionsRequired", ()) if not name.startswith(READ)]
         if needed:
             raise ValueError(f"compressed or special ({', '.join(needed)}): export it without")
@@ -233,6 +229,11 @@ class Document:
     @cached_property
     def _parents(self) -> dict[int, int]:
         return {child: i for i, node in enumerate(self.entries("nodes")) for child in node.get("children", ())}
+
+
+def _check_version(version: str) -> None:
+    if not version.startswith("2"):
+        raise ValueError(f"glTF of version {version}, not 2: export it as glTF 2.0")
 
 
 def _check_keys(document: Document, moves: dict[tuple[int, str], tuple]) -> None:

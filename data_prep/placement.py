@@ -30,8 +30,8 @@ MOSTLY = 0.5  # of a mesh's area, that is flat in a pattern before it is draped
 BELOW = 0.02  # m, below the soles
 AROUND = 0.5  # winding number of a garment about a joint of the body that it goes around
 OUTSIDE = 0.002  # m, mean depth inside the body, of what fits it
-CLOSE, NEARER = 0.05, 0.5  # m, from the body, of what is small; times its distance, of what fits better elsewhere
-UPRIGHT = ("y", "z")  # axes that point up in programs
+NEARER = 0.5  # times the distance of what fits, of what fits better elsewhere
+POINT_UP = ("y", "z")  # axes that point up in programs
 SAMPLE = 500  # vertices that stand for all
 
 
@@ -72,14 +72,14 @@ def check_place(path: str | Path, mesh: Mesh, body: Body, surface: Surface, plac
             turns = [(place.turn + turn) % 360 for turn in QUARTERS]
             places += [place._replace(units=units, up=up, turn=turn) for up in others for turn in turns]
     if place.shift == Placement().shift:  # many programs have the soles at zero
-        standing = [it for it in places if it.up in (place.up, *UPRIGHT) and it(sample)[:, 1].min() > -BELOW]
+        standing = [it for it in places if it.up in (place.up, *POINT_UP) and it(sample)[:, 1].min() > -BELOW]
         places += [it._replace(shift=soles) for it in standing]
     distance, depth = _fit(sample, surface, places)
     cost = np.where(distance < MAX_MEAN_DISTANCE, distance + INSIDE_PENALTY * depth, np.inf)
     large = 0.05 * height < METRES[place.units] * np.ptp(vertices, axis=0).max() < 1.5 * height
-    fits = depth < OUTSIDE  # such as a gown, which is far from the body, and a band around a wrist
-    wide = fits[0] and goes_around(place(vertices), mesh.faces, body)
-    if wide and (large or distance[0] < CLOSE) and not (distance[fits] < NEARER * distance[0]).any():
+    fits = depth < OUTSIDE
+    wide = large and fits[0] and goes_around(place(vertices), mesh.faces, body)  # such as a gown
+    if wide and not (distance[fits] < NEARER * distance[0]).any():
         return
     if not large:
         cost[[it.units == place.units for it in places]] = np.inf

@@ -108,11 +108,12 @@ def _obj(path: Path) -> Polygons:
             names = (name for own in current.values() for name in own if name and name != "default")
             corners = [_corner(number, word, counts["v"]) for word in rest]
             groups.setdefault(tuple(dict.fromkeys(names)), []).append(corners)
-    painted = np.array(colours).reshape(-1, 3)
-    known = painted[np.isfinite(painted)]
-    if not len(known):
-        return Polygons(np.array(vertices).reshape(-1, 3), None, groups)
-    return Polygons(np.array(vertices), painted * (255.0 if known.max() <= 1.0 else 1.0), groups)
+    return Polygons(np.array(vertices).reshape(-1, 3), _to_255(np.array(colours).reshape(-1, 3)), groups)
+
+
+def _to_255(colours: np.ndarray) -> np.ndarray:
+    """Return colours [V, 3] from 0 to 255; those up to 1 were shares."""
+    return colours * (255.0 if np.nanmax(colours, initial=0.0) <= 1.0 else 1.0)
 
 
 def _bare(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -175,8 +176,7 @@ def _off(path: Path) -> Polygons:
     colours = None
     if "C" in kind:
         first = 6 if "N" in kind else 3
-        painted = np.array([own[first : first + 3] for own in values], np.float64).reshape(points, 3)
-        colours = painted * (255.0 if painted.max(initial=0.0) <= 1.0 else 1.0)
+        colours = _to_255(np.array([own[first : first + 3] for own in values], np.float64).reshape(points, 3))
     polygons = []
     for number, words in rows[points : points + faces]:
         count = int(words[0]) if words[0].isdigit() else 0
@@ -222,7 +222,7 @@ def _ply(path: Path) -> Polygons:
     if {"red", "green", "blue"} <= vertex.keys():
         whole = elements["vertex"].scalars["red"][0] in "iu"
         colours = np.stack([np.array(vertex[name], np.float64) for name in ("red", "green", "blue")], axis=1)
-        colours *= 1.0 if whole or colours.max(initial=0.0) > 1.0 else 255.0
+        colours = colours if whole else _to_255(colours)
     return Polygons(vertices, colours, {(): [np.asarray(own).astype(int).tolist() for own in corners]})
 
 

@@ -54,7 +54,7 @@ class MotionOptions(OutputOptions):
     """Keep hands, fingers and toes still."""
 
 
-HIGHEST = 20.0  # m, of the hips in half of the frames, for a file that is read again
+TOO_HIGH = 20.0  # m, of the hips in half of the frames, for a file that is read again
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -165,7 +165,7 @@ def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, option
         ValueError: as `mend`; for a figure that is too far from the ground.
     """
     height = float(np.median(np.abs(motion.translation[:, 1])))
-    if height > HIGHEST:
+    if height > TOO_HIGH:
         raise ValueError(f"{recording}: the hips would be {height:.0f} m above the ground: give --up, or cut jumps out")
     motion, report = mend(motion, rig.body, options.bad)
     name = recording.name.partition(".")[0]
