@@ -18,8 +18,7 @@ STRAIGHT = 40.0  # degrees, by which trunk and legs of a rest pose may be off th
 TWISTED, KNEES = 10.0, 25.0  # degrees, by which shoulders may be off the hips, and knees bent, in a rest pose
 ALONG = 3.0  # degrees, by which a rest pose that faces along an axis may be off it
 BENT = 0.15  # least sine of the angle of a knee or elbow that shows its hinge
-LEVEL, ANKLE = 1 / 3, 0.15  # of the height of a figure, by which its feet may be off the ground; by which they are
-LOW, MOST_LOW = 0.05, 0.5  # of that, from below the ground up to which one that lies reaches
+LEVEL = 1 / 3  # of the height of a figure, by which its feet may be off the ground
 SEEN = 0.05  # share of the frames in which knees are bent, that shows which way they do
 
 
@@ -83,18 +82,12 @@ def up_axis(moving: Figure, parts: Parts, rest: str | None) -> str | None:
     return name
 
 
-def may_lie(moving: Figure, parts: Parts, up: np.ndarray, rest: np.ndarray) -> bool:
-    """Return whether a figure that is upright along one direction [3] may lie instead, as its rest pose has another up.
-
-    Then it does not stand at the zero of its file along the first, or is low above that along the other.
-    """
+def may_lie(moving: Figure, parts: Parts, up: np.ndarray) -> bool:
+    """Return whether a figure that is upright along a direction [3] does not stand at the zero of its file there."""
     head, feet = parts.chain[-1], [parts.limbs[f"{side} foot"] for side in SIDES]
-    known = [*parts.chain, *parts.limbs.values()]
-    soles, along = (moving.positions[:, feet] @ up).min(axis=1), moving.positions[:, known] @ rest
+    soles = (moving.positions[:, feet] @ up).min(axis=1)
     tall = np.median(np.abs(moving.positions[:, head] @ up - soles))
-    low, high = np.median(along.min(axis=1)) / tall, np.median(along.max(axis=1)) / tall
-    off = np.median(np.abs(soles)) / tall
-    return bool(off > LEVEL or (off > ANKLE and low > -LOW and high < MOST_LOW))
+    return bool(np.median(np.abs(soles)) > LEVEL * tall)
 
 
 def sides(moving: Figure, parts: Parts) -> str:

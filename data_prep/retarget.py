@@ -185,7 +185,7 @@ def _up(
         raise ValueError(f"{about}: it does not show which way is up: give --up y or --up z")
     if axes.forward is not None and axes.forward[-1] == up[-1]:
         raise ValueError(f"{about}: {up} is up, so --forward {axes.forward} cannot be forward")
-    lies = None not in (rest, seen) and rest != seen and rest_pose.may_lie(shown, parts, AXES[seen], AXES[rest])
+    lies = None not in (rest, seen) and rest != seen and rest_pose.may_lie(shown, parts, AXES[seen])
     if lies and axes.up is None:
         raise ValueError(
             f"{about}: its figure is upright along {seen}, but its rest pose has {rest} up: give --up {rest} if it "

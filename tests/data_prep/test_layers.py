@@ -351,6 +351,12 @@ def test_a_seam_of_which_every_third_vertex_is_off_is_noticed(body, names, save)
     assert len(boundary_loops(made.faces)) == 2 and not any("slits" in line for line in said)
 
 
+def test_small_holes_are_no_slits():
+    vertices, faces = tube(np.linspace(0.0, 0.18, 61), 0.2, 400)  # edges of three millimetres
+    kept = np.arange(len(faces)) % 137 != 50
+    assert check_seams("a.obj", vertices, faces[kept], 1e-4, False) == []
+
+
 def test_holes_of_a_scan_are_no_seams(body, names, save):
     vertices, faces = load("tshirt_4000", body)
     kept = np.ones(len(faces), bool)

@@ -486,6 +486,7 @@ def test_panels_that_lie_flat_are_refused(skirt, body, names, save):
     box = np.concatenate([panel - [0, 0, 0.2], panel + [0, 0, 0.2]])
     with pytest.raises(ValueError, match=r"skirt\.obj: 100 % of it lies in flat parts"):
         bring(save(box, np.concatenate([faces, faces + 400, walls])), body, names, Answers(pin="highest"))
+    bring(save(panel - [0, 0, 0.2], faces), body, names, Answers(loose=False))  # one may be a cape
     with_patch = np.concatenate([skirt[0], 0.1 * panel + [0, 0, 0.25]])  # a label on a skirt
     bring(save(with_patch, np.concatenate([skirt[1], faces + len(skirt[0])])), body, names, Answers(loose=False))
 
