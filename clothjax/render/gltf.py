@@ -10,9 +10,12 @@ from clothjax.render.ray_cast import vertex_normals
 
 COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}  # glTF's numbers of types
 POSITIONS, INDICES = 34962, 34963  # buffer targets
+MOST = 128  # morph targets; a garment that folds needs about 100 for a clip of 120 frames
 
 
-def to_glb(path: str | Path, performance: Performance, *, tolerance: float = 1e-3, most: int = 48) -> dict[str, float]:
+def to_glb(
+    path: str | Path, performance: Performance, *, tolerance: float = 1e-3, most: int = MOST
+) -> dict[str, float]:
     """Write a binary glTF; return the largest error in m of each mesh.
 
     Shapes are compressed by principal components into morph targets: enough to bring every vertex within `tolerance` m,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from clothjax.render.gltf import POSITIONS, Document, principal_components
+from clothjax.render.gltf import MOST, POSITIONS, Document, principal_components
 from clothjax.render.performance import SkinnedPerformance
 from clothjax.types import Array
 
@@ -14,7 +14,7 @@ LOST = 0.01  # of a vertex's weights, above which a second set is written
 
 
 def to_skinned_glb(
-    path: str | Path, performance: SkinnedPerformance, *, tolerance: float = 1e-3, most: int = 48
+    path: str | Path, performance: SkinnedPerformance, *, tolerance: float = 1e-3, most: int = MOST
 ) -> dict[str, float]:
     """Write a binary glTF of skinned meshes; return the largest error in m of each one's canonical vertices.
 

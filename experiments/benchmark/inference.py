@@ -288,10 +288,11 @@ def c_call(library: Path, path: Path, model: Model, vertices: bool = True) -> Ca
 
 def jax_call(model: Model, vertices: bool = True) -> Call:
     """Return a call of one frame in jax, compiled."""
-    pose = _pose(model)
+    pose, (leaves, tree) = _pose(model), jax.tree.flatten(model)
     state = inference.initial_state(model, pose)
-    compiled = inference.step.lower(model, state, pose, vertices).compile()
-    return lambda: jax.block_until_ready(compiled(model, state, pose))
+    step = jax.jit(lambda leaves, state, pose: inference.step(tree.unflatten(leaves), state, pose, vertices))
+    compiled = step.lower(leaves, state, pose).compile()
+    return lambda: jax.block_until_ready(compiled(leaves, state, pose))
 
 
 def packed_call(model: Model) -> Call:

@@ -21,6 +21,7 @@ from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
 from clothjax.networks.baselines import inputs as baseline_inputs
 from clothjax.runtime import loading, specialise, trained
+from clothjax.runtime.models import ForcePredictor
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
@@ -118,8 +119,8 @@ def _skinning(case: Case, folder: Path) -> Variant:
 def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, float]) -> dict[str, Variant]:
     """Return Psi in ONNX Runtime and in plain C, with all blend shapes and with fewer.
 
-    In ONNX Runtime it is timed twice: with pose inputs and skinning transforms given, like a baseline, and from the
-    pose, like in C.
+    In ONNX Runtime one without forces is timed twice: with pose inputs and skinning transforms given, like a baseline,
+    and from the pose, like in C.
     """
     folder = Path(tempfile.mkdtemp(dir=folder))
     model = loading.load(run, betas=np.asarray(case.character.betas))
@@ -135,9 +136,12 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
             path = onnx.to_onnx(form, folder / f"{len(variants)}.onnx", int8=int8)
             tracks = [relative(lambda m, p=path, f=form: onnx.run_onnx(p, f, m), clip) for clip in case.clips]
             label = f"{name}, int8" if int8 else name
-            spared = given_features(form, folder / "spared.onnx", int8=int8)
-            variants[label] = Variant(family, "onnx", tracks, session_call(spared))
-            variants[f"{label}, from the pose"] = Variant(family, "onnx", tracks, onnx_call(path, form))
+            from_pose = Variant(family, "onnx", tracks, onnx_call(path, form))
+            if isinstance(form.network.predictor, ForcePredictor):
+                variants[label] = from_pose
+            else:
+                spared = session_call(given_features(form, folder / "spared.onnx", int8=int8))
+                variants |= {label: from_pose._replace(call=spared), f"{label}, from the pose": from_pose}
         if library:
             path = native.to_c(form, folder / f"{len(variants)}.psi")
             tracks = [relative(lambda m, p=path: native.run_c(library, p, m), clip) for clip in case.clips]

@@ -29,9 +29,8 @@ def start(config: Path, directory: Path, cache: Path) -> subprocess.Popen:
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     command = [sys.executable, killed.__file__, str(config), "--directory", str(directory)]
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.DEVNULL, stderr=(directory.parent / "stderr").open("w")
-    )
+    with (directory.parent / "stderr").open("w") as log:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=log)
 
 
 def a_moment(run: subprocess.Popen, directory: Path, rng: np.random.Generator, seconds: float) -> float:
