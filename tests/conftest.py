@@ -51,7 +51,8 @@ def shared() -> Path:
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     """A folder with the project in it, and what the commands of the documents call a user's own."""
-    import rigged  # after the settings above
+    import recorded  # after the settings above
+    import rigged
     import samples
 
     from clothjax.files import storage
@@ -61,9 +62,10 @@ def workplace(tmp_path_factory):
         (folder / name).symlink_to(samples.ROOT / name)
     for name, clip in {"my_walk": "walk_1", "my_run": "run_1", "my_take": "dance_1", "other": "walk_2"}.items():
         shutil.copy(storage.asset(clip), folder / f"{name}.h5")
-    (folder / "02.asf").write_text(samples.ASF)
-    (folder / "02_01.amc").write_text(samples.AMC)
-    (folder / "walk.bvh").write_text(samples.BVH)
+    for name, text in zip(("02.asf", "02_01.amc"), samples.standing()):
+        (folder / name).write_text(text)
+    taken = recorded.take("walk", 0, 30)
+    recorded.write_bvh(folder / "walk.bvh", taken, "0.0333333", ["zxy"] * len(taken.names))
     np.savez(folder / "02_01_poses.npz", **samples.recording())
     (folder / "SMPL_FEMALE.pkl").write_bytes(pickle.dumps(samples.smpl_arrays(), protocol=2))
     rigged.another(folder / "character.glb")

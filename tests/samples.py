@@ -216,6 +216,35 @@ root 2 2 3 10 20 30
 lfemur 90 0
 ltibia 45
 """
+
+
+def standing() -> tuple[str, str]:
+    """Return an ASF and an AMC file of a whole figure that stands with its arms aside, in CMU's names and lengths."""
+    bones = [("lowerback", "root", "0 1 0", 2.0), ("thorax", "lowerback", "0 1 0", 4.0)]
+    bones += [("lowerneck", "thorax", "0 1 0", 2.0), ("head", "lowerneck", "0 1 0", 2.0)]
+    for side, x in (("l", 1), ("r", -1)):
+        bones += [
+            (f"{side}hipjoint", "root", f"{0.8 * x} -0.6 0", 2.0),
+            (f"{side}femur", f"{side}hipjoint", "0 -1 0", 7.0),
+        ]
+        bones += [(f"{side}tibia", f"{side}femur", "0 -1 0", 7.0), (f"{side}foot", f"{side}tibia", "0 -0.3 0.95", 2.0)]
+        bones += [(f"{side}toes", f"{side}foot", "0 0 1", 1.0), (f"{side}clavicle", "thorax", f"{x} 0 0", 3.0)]
+        bones += [
+            (f"{side}humerus", f"{side}clavicle", f"{x} 0 0", 5.0),
+            (f"{side}radius", f"{side}humerus", f"{x} 0 0", 4.0),
+        ]
+        bones += [(f"{side}hand", f"{side}radius", f"{x} 0 0", 1.5)]
+    head, rest = ASF[: ASF.index(":bonedata")], [":bonedata"]
+    for name, _, direction, length in bones:
+        rest += ["  begin", f"     name {name}", f"     direction {direction}", f"     length {length}"]
+        rest += ["     axis 0 0 0 XYZ", "    dof rx ry rz", "  end"]
+    rest += [":hierarchy", "  begin", *(f"    {parent} {name}" for name, parent, *_ in bones), "  end", ""]
+    frames = [":FULLY-SPECIFIED", ":DEGREES"]
+    for frame in range(1, 31):
+        frames += [str(frame), f"root 0 16.2 {0.01 * frame} 0 0 0", *(f"{name} 0 0 0" for name, *_ in bones)]
+    return head + "\n".join(rest), "\n".join([*frames, ""])
+
+
 BVH = """HIERARCHY
 ROOT Hips
 {

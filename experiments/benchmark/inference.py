@@ -3,7 +3,9 @@
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -236,8 +238,7 @@ def _crowd(rounds: int, crowds: tuple[int, ...]) -> dict:
         pose = _pose(wearers[0])
         states = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), inference.initial_state(wearers[0], pose))
         poses = jax.tree.map(lambda x, n=count: jnp.stack([x] * n), pose)
-        step = jax.jit(inference.step_crowd).lower(crowd, states, poses).compile()
-        calls[str(count)] = lambda step=step, a=(crowd, states, poses): jax.block_until_ready(step(*a))
+        calls[str(count)] = compiled(inference.step_crowd, crowd, states, poses)
     us = {name: each / int(name) for name, each in interleaved(calls, max(3, rounds // 10)).items()}
     last = "256" if "256" in us else str(crowds[-1])
     return {"crowd_us": us, "crowd_ratio": us[last] / us["1"]}
@@ -288,19 +289,24 @@ def c_call(library: Path, path: Path, model: Model, vertices: bool = True) -> Ca
 
 def jax_call(model: Model, vertices: bool = True) -> Call:
     """Return a call of one frame in jax, compiled."""
-    pose, (leaves, tree) = _pose(model), jax.tree.flatten(model)
+    pose = _pose(model)
     state = inference.initial_state(model, pose)
-    step = jax.jit(lambda leaves, state, pose: inference.step(tree.unflatten(leaves), state, pose, vertices))
-    compiled = step.lower(leaves, state, pose).compile()
-    return lambda: jax.block_until_ready(compiled(leaves, state, pose))
+    return compiled(lambda model, state, pose: inference.step(model, state, pose, vertices), model, state, pose)
+
+
+def compiled(step: Callable, model: Model, *arguments: Any) -> Call:
+    """Return a call of a compiled program; it takes the leaves of a model, which jax describes one by one."""
+    leaves, tree = jax.tree.flatten(model)
+    program = jax.jit(lambda leaves, *rest: step(tree.unflatten(leaves), *rest)).lower(leaves, *arguments).compile()
+    return lambda: jax.block_until_ready(program(leaves, *arguments))
 
 
 def packed_call(model: Model) -> Call:
     """Return a call of one frame in jax, compiled, that calls plain C."""
     pose, packed = _pose(model), psi_ffi.pack(model)
     state = inference.initial_state(model, pose)
-    compiled = psi_ffi.step.lower(packed, state, pose).compile()
-    return lambda: jax.block_until_ready(compiled(packed, state, pose))
+    program = psi_ffi.step.lower(packed, state, pose).compile()
+    return lambda: jax.block_until_ready(program(packed, state, pose))
 
 
 def _pose(model: Model) -> Pose:
