@@ -83,7 +83,7 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
     assert figures["export_error_mm"]["onnx"] < 0.1 and figures["export_error_mm"]["stablehlo"] < 0.1
     rest = figures["resting"]
     assert rest["frames_moving"] < rest["frames_taken"] < rest["frames"] and 0 < rest["error_mm_max"] < 1.0
-    assert figures["forces"]["us"]["skirt: onnx"] > figures["forces"]["us"]["tshirt: onnx"]
+    assert figures["forces"]["us"][f"{inference.FORCED}: onnx"] > figures["forces"]["us"][f"{inference.SHIPPED}: onnx"]
     if native.compiler():
         assert variants["C: folded"]["error_mm"] < variants["folded, int8"]["error_mm"]
 
