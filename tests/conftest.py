@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before JAX is imported; child processes inherit it
+# before JAX is imported; child processes inherit them
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")  # of what `compiled_once` keeps
 
 import jax
 
@@ -24,10 +26,7 @@ def compiled_once(tmp_path_factory, worker_id):
     base = tmp_path_factory.getbasetemp()
     cache = (base if worker_id == "master" else base.parent) / "compiled"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))  # for child processes
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")  # a second by default
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-    shortest = float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -218,31 +218,30 @@ ltibia 45
 """
 
 
+SPINE = (("lowerback", "root", "0 1 0", 2), ("thorax", "lowerback", "0 1 0", 4), ("lowerneck", "thorax", "0 1 0", 2),
+         ("head", "lowerneck", "0 1 0", 2))  # fmt: skip
+LEFT = (("lhipjoint", "root", "0.8 -0.6 0", 2), ("lfemur", "lhipjoint", "0 -1 0", 7), ("ltibia", "lfemur", "0 -1 0", 7),
+        ("lfoot", "ltibia", "0 -0.3 0.95", 2), ("ltoes", "lfoot", "0 0 1", 1), ("lclavicle", "thorax", "1 0 0", 3),
+        ("lhumerus", "lclavicle", "1 0 0", 5), ("lradius", "lhumerus", "1 0 0", 4))  # fmt: skip
+
+
 def standing() -> tuple[str, str]:
     """Return an ASF and an AMC file of a whole figure that stands with its arms aside, in CMU's names and lengths."""
-    bones = [("lowerback", "root", "0 1 0", 2.0), ("thorax", "lowerback", "0 1 0", 4.0)]
-    bones += [("lowerneck", "thorax", "0 1 0", 2.0), ("head", "lowerneck", "0 1 0", 2.0)]
-    for side, x in (("l", 1), ("r", -1)):
-        bones += [
-            (f"{side}hipjoint", "root", f"{0.8 * x} -0.6 0", 2.0),
-            (f"{side}femur", f"{side}hipjoint", "0 -1 0", 7.0),
-        ]
-        bones += [(f"{side}tibia", f"{side}femur", "0 -1 0", 7.0), (f"{side}foot", f"{side}tibia", "0 -0.3 0.95", 2.0)]
-        bones += [(f"{side}toes", f"{side}foot", "0 0 1", 1.0), (f"{side}clavicle", "thorax", f"{x} 0 0", 3.0)]
-        bones += [
-            (f"{side}humerus", f"{side}clavicle", f"{x} 0 0", 5.0),
-            (f"{side}radius", f"{side}humerus", f"{x} 0 0", 4.0),
-        ]
-        bones += [(f"{side}hand", f"{side}radius", f"{x} 0 0", 1.5)]
-    head, rest = ASF[: ASF.index(":bonedata")], [":bonedata"]
+    sided = {name for name, *_ in LEFT}
+    right = [
+        ("r" + name[1:], "r" + parent[1:] if parent in sided else parent, f"-{direction}", length)
+        for name, parent, direction, length in LEFT
+    ]
+    bones = [*SPINE, *LEFT, *right]
+    lines = [ASF[: ASF.index(":bonedata")] + ":bonedata"]
     for name, _, direction, length in bones:
-        rest += ["  begin", f"     name {name}", f"     direction {direction}", f"     length {length}"]
-        rest += ["     axis 0 0 0 XYZ", "    dof rx ry rz", "  end"]
-    rest += [":hierarchy", "  begin", *(f"    {parent} {name}" for name, parent, *_ in bones), "  end", ""]
+        lines += ["begin", f"name {name}", f"direction {direction}", f"length {length}", "axis 0 0 0 XYZ"]
+        lines += ["dof rx ry rz", "end"]
+    lines += [":hierarchy", "begin", *(f"{parent} {name}" for name, parent, *_ in bones), "end", ""]
     frames = [":FULLY-SPECIFIED", ":DEGREES"]
     for frame in range(1, 31):
         frames += [str(frame), f"root 0 16.2 {0.01 * frame} 0 0 0", *(f"{name} 0 0 0" for name, *_ in bones)]
-    return head + "\n".join(rest), "\n".join([*frames, ""])
+    return "\n".join(lines), "\n".join([*frames, ""])
 
 
 BVH = """HIERARCHY

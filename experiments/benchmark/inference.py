@@ -295,18 +295,16 @@ def jax_call(model: Model, vertices: bool = True) -> Call:
 
 
 def compiled(step: Callable, model: Model, *arguments: Any) -> Call:
-    """Return a call of a compiled program; it takes the leaves of a model, which jax describes one by one."""
+    """Return a call of a compiled step; it takes the leaves of a model, which jax describes one by one."""
     leaves, tree = jax.tree.flatten(model)
-    program = jax.jit(lambda leaves, *rest: step(tree.unflatten(leaves), *rest)).lower(leaves, *arguments).compile()
-    return lambda: jax.block_until_ready(program(leaves, *arguments))
+    return timing.program(lambda leaves, *rest: step(tree.unflatten(leaves), *rest), leaves, *arguments)
 
 
 def packed_call(model: Model) -> Call:
     """Return a call of one frame in jax, compiled, that calls plain C."""
     pose, packed = _pose(model), psi_ffi.pack(model)
     state = inference.initial_state(model, pose)
-    program = psi_ffi.step.lower(packed, state, pose).compile()
-    return lambda: jax.block_until_ready(program(packed, state, pose))
+    return timing.program(psi_ffi.step, packed, state, pose)
 
 
 def _pose(model: Model) -> Pose:
