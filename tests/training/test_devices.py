@@ -126,6 +126,7 @@ ONE_AND_FOUR = """
 import sys
 import jax
 import numpy as np
+import optax
 from clothjax.config import Config
 from clothjax.files import configuration
 from clothjax.simulation import assembly
@@ -138,16 +139,17 @@ after, teachers = [], []
 for mesh in (None, devices.choose("auto", config.stage1.batch)):
     state = devices.replicate(stage1.init(experiment.scene, reel, config), mesh)
     state, metrics = stage1.make_update(experiment.scene, reel, config, 1, 1, mesh)(state)
-    after.append(jax.device_get((state.params, state.pool.cloth, metrics["loss"])))
+    gradient = optax.tree.get(state.optimizer, "mu")  # times a constant, after the first update
+    after.append(jax.device_get(((state.params, state.pool.cloth, metrics["loss"]), gradient)))
     first = jax.device_get({"params": state.params, "statistics": state.statistics}) if mesh is None else first
     model = devices.replicate(first, mesh)
     teacher = stage2.teach(model, experiment.scene, reel, np.arange(5), config, device_mesh=mesh)[0]
     teachers.append(teacher._replace(latents=teacher.latents[:, :3]))  # later frames have amplified the rounding
 print(len(jax.devices()), "devices")
-for one, four in zip(jax.tree.leaves(after[0]), jax.tree.leaves(after[1]), strict=True):
-    np.testing.assert_allclose(one, four, rtol=1e-5, atol=5e-5)
 for one, four in zip(jax.tree.leaves(after[0][0]), jax.tree.leaves(after[1][0]), strict=True):
-    np.testing.assert_allclose(one, four, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(one, four, rtol=1e-5, atol=5e-5)
+for one, four in zip(jax.tree.leaves(after[0][1]), jax.tree.leaves(after[1][1]), strict=True):
+    np.testing.assert_allclose(one, four, rtol=0, atol=1e-4 * np.abs(one).max())
 for one, four in zip(teachers[0], teachers[1], strict=True):
     np.testing.assert_allclose(one, four, rtol=0, atol=3e-3 * max(1.0, np.abs(one).max()))
 """
@@ -164,7 +166,7 @@ def test_a_batch_of_any_stage_that_cannot_be_divided_is_refused_before_training(
 
 @pytest.mark.slow
 def test_four_devices_take_the_step_of_one(config):
-    """Parameters to 1e-6 after one update; after that Adam turns rounding into whole steps. Teachers likewise."""
+    """Gradients to 1e-4: Adam turns the rounding of one near zero into a part of its step. Teachers likewise."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     done = subprocess.run(
         [sys.executable, "-c", ONE_AND_FOUR, str(config)], capture_output=True, text=True, cwd=ROOT, env=environment

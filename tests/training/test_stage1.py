@@ -94,44 +94,50 @@ def test_a_simulation_whose_energy_tells_that_it_is_lost_is_begun_anew(toy, upda
     assert np.abs(begun.betas[0] - betas).max() > 0
 
 
-def _play(experiment, reel, params, motion, advance_turn):
-    scene, config = experiment.scene, experiment.config
-    moved = motion._replace(
-        rotations=np.concatenate([np.einsum("ab,tbc->tac", advance_turn, motion.rotations[:, 0])[:, None],
-                                  motion.rotations[:, 1:]], axis=1).astype(np.float32),
-    )  # fmt: skip
-    poses = jax.tree.map(jnp.asarray, assembly.windows(moved))
-    poses = jax.vmap(lambda t: motion_clips.poses(poses, t))(jnp.arange(1, 20))
-    character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    phi = animators.phi_animator(params, scene, character, config)
-    new, states, _ = jax.jit(lambda poses: rollout.play(phi, scene, character, poses, config))(poses)
-    np.testing.assert_allclose(states.change[1:], np.diff(states.latent, axis=0), atol=1e-6)
-    np.testing.assert_array_equal(states.change[0], 0.0)  # not what settling changed
-    return np.asarray(new), np.asarray(character.joints[0])
-
-
 @pytest.mark.slow
 def test_phi_does_not_see_place_or_heading(toy, update):
     experiment, reel = toy
-    state = stage1.init(experiment.scene, reel, experiment.config)
+    scene, config = experiment.scene, experiment.config
+    state = stage1.init(scene, reel, config)
     for _ in range(20):
         state, _ = update(state)
-    model = {"params": state.params, "statistics": state.statistics}
+    character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
+    phi = animators.phi_animator({"params": state.params, "statistics": state.statistics}, scene, character, config)
+    play = jax.jit(lambda poses: rollout.play(phi, scene, character, poses, config))
+    steps = jax.jit(
+        jax.vmap(lambda s, p: rollout.take(phi, scene, character, s, p, 1 / config.fps, config)[1].position)
+    )
+
     motion = assembly.motion(experiment, "walk_0")
+    plain, states, _ = play(_windows(motion))
+    np.testing.assert_allclose(states.change[1:], np.diff(states.latent, axis=0), atol=1e-6)
+    np.testing.assert_array_equal(states.change[0], 0.0)  # not what settling changed
+    far = motion._replace(translation=motion.translation + np.array([1000.0, 0.0, -500.0]))
+    np.testing.assert_allclose(play(_windows(far))[0], plain, atol=2e-5)
+
     angle = 1.1
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    plain, root = _play(experiment, reel, model, motion, np.eye(3))
-    far = motion._replace(translation=motion.translation + np.array([1000.0, 0.0, -500.0]))
-    elsewhere, _ = _play(experiment, reel, model, far, np.eye(3))
-    np.testing.assert_allclose(elsewhere, plain, atol=2e-5)
-    turned = motion._replace(translation=motion.translation @ turn.T)
-    heading, _ = _play(experiment, reel, model, turned, turn)
-    # The root joint, about which the body turns, is not at the origin. A turned body differs by rounding, 3e-7 m. From
-    # the second frame on a choice of the line search may fall otherwise: 3e-5 m there and 2e-4 m in the eighth were
-    # seen, over four seeds, as much as from a rounding of the poses alone.
-    difference = (heading - root) - (plain - root) @ turn.T
-    np.testing.assert_allclose(difference[0], 0.0, atol=2e-6)
-    np.testing.assert_allclose(difference[:8], 0.0, atol=5e-4)
+    rotations = motion.rotations.copy()
+    rotations[:, 0] = np.einsum("ab,tbc->tac", turn, rotations[:, 0])
+    turned = motion._replace(rotations=rotations, translation=motion.translation @ turn.T)
+    root = np.asarray(character.joints[0])  # about which the body turns: it is not at the origin
+
+    def moved(positions):
+        return ((np.asarray(positions) - root) @ turn.T + root).astype(np.float32)
+
+    velocity, acceleration = (
+        (np.asarray(x) @ turn.T).astype(np.float32) for x in (states.velocity, states.acceleration)
+    )
+    elsewhere = states._replace(position=moved(states.position), velocity=velocity, acceleration=acceleration)
+    heading = steps(elsewhere, _windows(turned))
+    error = np.abs(heading - moved(steps(states, _windows(motion)))).max(axis=(1, 2))
+    # where two steps of a line search are as good, rounding chooses: in none or one of 19 frames, over two seeds
+    assert np.sort(error)[-4] < 2e-5, error
+
+
+def _windows(motion):
+    poses = jax.tree.map(jnp.asarray, assembly.windows(motion))
+    return jax.vmap(lambda t: motion_clips.poses(poses, t))(jnp.arange(1, 20))
 
 
 def _untrained(experiment, reel):
