@@ -64,7 +64,7 @@ def test_documents_are_in_short_sentences():
 @pytest.mark.slow
 @pytest.mark.parametrize("name, code", blocks("python"))
 def test_python_from_the_wheel_alone(name, code, wheel, tmp_path):
-    for setting, short in (("steps", 20), ("sequences", 2), ("rounds", 1), ("simulations", 2)):
+    for setting, short in (("steps", 20), ("last_steps", 20), ("sequences", 2), ("rounds", 1), ("simulations", 2)):
         code = re.sub(rf'"{setting}": \d+', f'"{setting}": {short}', code)
     environment = os.environ | {"PYTHONPATH": str(wheel)}
     code = f"import clothjax; assert clothjax.__file__.startswith({str(wheel)!r})\n" + code
