@@ -26,7 +26,10 @@ COMMANDS = {
 }
 PROGRAMS = {  # kind -> names of the program, and its use
     "C": (("cc", "gcc", "clang"), "the plain C runtime"),
-    "C++": (("c++", "g++", "clang++"), "jax that calls the plain C runtime"),
+    "C++": (
+        ("c++", "g++", "clang++"),
+        "training on a CPU in less time; jax that calls the plain C runtime",
+    ),
     "Node.js": (("npm",), "experiments.web, and its tests"),
     "Chromium": (("chromium", "google-chrome"), "the tests of the demo and of the web page"),
 }

@@ -10,6 +10,7 @@ import numpy as np
 
 from clothjax.export import litert, native, onnx, safetensors, stablehlo
 from clothjax.export.sidecar import Output
+from clothjax.physics import compilers
 from clothjax.runtime import inference, specialise
 from clothjax.runtime.models import Model
 from clothjax.types import Motion
@@ -55,7 +56,7 @@ def _run_litert(path: Path, model: Model, motion: Motion, options: Options) -> n
 
 
 def _run_c(path: Path, _model: Model, motion: Motion, _options: Options) -> np.ndarray | None:
-    if native.compiler() is None:
+    if compilers.compiler("C") is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
         return native.run_c(native.build(folder), path, motion)

@@ -7,8 +7,7 @@ Inputs that differ in scale are first multiplied by gains.
 
 import ctypes
 import shutil
-import subprocess
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from clothjax.geometry.proximity import even, halved
 from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
+from clothjax.physics import compilers
 from clothjax.physics.energies import GRAVITY, THICKNESS
 from clothjax.runtime import drape
 from clothjax.runtime.models import CAUSES, Bounds, FoldedLayer, ForcePredictor, Layer, Model, PosePredictor
@@ -31,7 +31,6 @@ FORCED = 6  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
-FLAGS = ("-O3", "-march=native")
 
 
 def to_c(model: Model, path: str | Path, about: dict | None = None) -> Path:
@@ -243,12 +242,7 @@ def eight_bits(kernel: Array, gains: bool) -> tuple[np.ndarray, np.ndarray, np.n
     return np.rint(rows / scale[:, None]).astype(np.int8), gain.astype(np.float32), scale.astype(np.float32)
 
 
-def compiler() -> str | None:
-    """Return this machine's C compiler, None if there is none."""
-    return next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
-
-
-def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
+def build(directory: str | Path, flags: tuple[str, ...] = compilers.FLAGS) -> Path:
     """Compile `psi.c` into a shared library in a folder; return its path.
 
     Args:
@@ -258,26 +252,8 @@ def build(directory: str | Path, flags: tuple[str, ...] = FLAGS) -> Path:
         OSError: if there is no compiler, or it fails.
     """
     library = Path(directory) / "libpsi.so"
-    run_compiler(compiler(), "C", [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
+    compilers.run("C", [*flags, "-fPIC", "-shared", "-o", library, SOURCES[1], "-lm"])
     return library
-
-
-def run_compiler(program: str | None, language: str, arguments: Sequence[str | Path]) -> None:
-    """Run a compiler, and raise what it says if it fails.
-
-    Args:
-        program: its path; None if there is none.
-        language: for the message.
-
-    Raises:
-        OSError: if there is no compiler, or it fails.
-    """
-    if program is None:
-        raise OSError(f"no compiler for {language} on the path: install gcc or clang")
-    command = [program, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
 
 
 class Psi:

@@ -4,11 +4,8 @@ XLA has no fast product of a vector and a matrix of low precision; `psi.c` has. 
 packed, which needs a C and a C++ compiler, and registered with `jax.ffi`.
 """
 
-import ctypes
 import dataclasses
 import functools
-import shutil
-import tempfile
 from pathlib import Path
 
 import jax
@@ -17,12 +14,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from clothjax.export import native
+from clothjax.physics import compilers
 from clothjax.runtime import inference
 from clothjax.runtime.models import CAUSES, Model, State
 from clothjax.types import Array, Pose
 
 SOURCE = Path(__file__).with_name("psi_ffi.cc")
-TARGET = "clothjax_psi_step"
+TARGET = "PsiStep"
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("file",), meta_fields=("vertices",))
@@ -36,11 +34,7 @@ class Packed:
 
 def available() -> bool:
     """Return whether `pack` can work here: jax computes on a CPU, and a C and a C++ compiler are present."""
-    return jax.default_backend() == "cpu" and None not in (native.compiler(), _compiler())
-
-
-def _compiler() -> str | None:
-    return next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    return jax.default_backend() == "cpu" and None not in map(compilers.compiler, compilers.PROGRAMS)
 
 
 def pack(model: Model) -> Packed:
@@ -51,20 +45,8 @@ def pack(model: Model) -> Packed:
     """
     if jax.default_backend() != "cpu":
         raise OSError(f"plain C inside of jax is for CPUs; jax computes on {jax.default_backend()} (JAX_PLATFORMS=cpu)")
-    _register()
+    compilers.register(SOURCE, (TARGET,), native.SOURCES[1])
     return Packed(jnp.asarray(np.frombuffer(native.packed(model), np.uint8)), model.wearer.template.shape[1])
-
-
-@functools.cache
-def _register() -> None:
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        plain, library = Path(folder) / "psi.o", Path(folder) / "libpsi_ffi.so"
-        native.run_compiler(native.compiler(), "C", [*native.FLAGS, "-fPIC", "-c", native.SOURCES[1], "-o", plain])
-        includes = [f"-I{folder}" for folder in (native.SOURCES[0].parent, jax.ffi.include_dir())]
-        shared = ["-std=c++17", "-O2", "-fPIC", "-shared", *includes, SOURCE, plain, "-o", library]
-        native.run_compiler(_compiler(), "C++", shared)
-        handler = ctypes.CDLL(str(library)).PsiStep  # it stays loaded when its file is gone
-    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
 
 
 @functools.partial(jax.jit, static_argnames="vertices")

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from clothjax.config import PhysicsConfig
 from clothjax.geometry.vectors import at_corners
-from clothjax.physics import contact_search
+from clothjax.physics import contact_search, kernels
 from clothjax.physics.energies import bending, collision, friction, gravity, inertia, stretching
 from clothjax.types import Array, Contact, EdgeContact, Material, Mesh, Rest, Scalar, SelfContact
 
@@ -134,4 +134,19 @@ def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: Phys
 
     A time step of the cloth minimises it.
     """
-    return sum(energies(new, step, mesh, config).values())  # pyright: ignore[reportReturnType]  # there are terms
+    terms = energies(new, step, mesh, config)
+    if kernels.used(new, mesh):
+        terms |= {name: energy for name, energy in _in_kernels(new, step, mesh, config).items() if name in terms}
+    return sum(terms.values())  # pyright: ignore[reportReturnType]  # there are terms
+
+
+def _in_kernels(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
+    """Return the energies that kernels have, in J."""
+    terms = {
+        "stretching": kernels.stretching(new, step.rest, step.material, mesh),
+        "bending": kernels.bending(new, step.rest, step.material, mesh),
+    }
+    if step.edge_contact is not None:
+        stiffness, offset = config.collision_stiffness, config.collision_offset
+        terms["edge_collision"] = kernels.edge_collision(new, step.edge_contact, mesh, stiffness, offset)
+    return terms

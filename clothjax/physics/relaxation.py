@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from clothjax.geometry.vectors import at_corners
-from clothjax.physics import energies
+from clothjax.physics import energies, kernels
 from clothjax.types import Array, Material, Mesh, Rest
 
 RATE = 0.8  # of a Jacobi step; above 1.3 the shortest waves of a regular mesh grow
@@ -88,7 +88,8 @@ def relaxed(
     Args:
         mobility: [V] m/N, of `mobility`.
     """
-
+    if steps > 0 and kernels.used(position, mesh):
+        return kernels.relaxed(position, mobility, rest, material, mesh, steps, LONGEST)
     elastic = Elastic(rest.inverse, rest.face_area, material.mu, material.lam)
     for _ in range(steps):
         move = -mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)

@@ -16,7 +16,7 @@ from clothjax.files import damage
 from clothjax.material import unscaled
 from clothjax.networks import animators, phi, psi
 from clothjax.networks.normalisation import ForceScales
-from clothjax.physics import descent, incremental_potential
+from clothjax.physics import descent, incremental_potential, kernels
 from clothjax.physics.energies import GRAVITY
 from clothjax.simulation import characters, rollout, time_step
 from clothjax.simulation.scene import Scene
@@ -204,7 +204,9 @@ def make_collect(
     """
     # several simulations read the blend shapes together, but wait for the longest descent among them
     together = sampling.ON_CPU if len(scene.garment.vertices) >= LARGE else 1
-    sample = sampling.make_sampler(make_segment(scene, config), device_mesh, together, elsewhere=ON_GPU)
+    sample = sampling.make_sampler(
+        kernels.in_kernels(make_segment(scene, config)), device_mesh, together, elsewhere=ON_GPU
+    )
     clips = jax.tree.map(jnp.asarray, clips)
 
     def collect(policy: Policy, simulations: Simulation, seed: int, progress: Callable[[int], None]) -> Round:

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from clothjax.body import skinning
 from clothjax.body.motion_clips import Clips
 from clothjax.config import Config
-from clothjax.physics import descent
+from clothjax.physics import descent, kernels
 from clothjax.simulation import characters, rollout
 from clothjax.simulation.rollout import Animator, StepInput, StepOutput
 from clothjax.simulation.scene import Scene
@@ -109,7 +109,7 @@ def simulate(
 
     arguments = (jax.tree.map(jnp.asarray, clips), jnp.asarray(inverse))
     keys = sampling.keys(settings.seed, settings.sequences)
-    displacements = sampling.make_sampler(sequence, device_mesh)(keys, arguments, progress, folder)
+    displacements = sampling.make_sampler(kernels.in_kernels(sequence), device_mesh)(keys, arguments, progress, folder)
     good = np.abs(displacements).max(axis=(1, 2, 3)) < MAX_DISPLACEMENT
     if not good.any():
         raise ValueError(

@@ -16,6 +16,7 @@ from clothjax.body.motion_clips import Clips
 from clothjax.config import Config, ModelConfig
 from clothjax.networks import animators, decoder, mlp, normalisation, psi
 from clothjax.networks.normalisation import Normalizers
+from clothjax.physics import kernels
 from clothjax.simulation import rollout
 from clothjax.simulation.scene import Scene
 from clothjax.training import devices, loop, pool, sampling
@@ -104,7 +105,7 @@ def teach(
     began = time.monotonic()
     sequence = make_rollout(scene, input_joints, config)
     keys = sampling.keys(stage.seed + 1, stage.sequences)
-    teacher = sampling.make_sampler(sequence, device_mesh)(keys, (model, clips), progress)
+    teacher = sampling.make_sampler(kernels.in_kernels(sequence), device_mesh)(keys, (model, clips), progress)
     good = np.isfinite(teacher.latents).all(axis=(1, 2))
     if not good.any():
         raise ValueError("no rollout of Phi stayed finite: train stage 1 further before stage 2")

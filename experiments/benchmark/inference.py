@@ -21,6 +21,7 @@ from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import configuration, storage
 from clothjax.networks import decoder, psi
 from clothjax.networks.normalisation import Normalizers, Scale
+from clothjax.physics import compilers
 from clothjax.runtime import inference, loading, specialise
 from clothjax.runtime.models import Model
 from clothjax.simulation import assembly
@@ -278,7 +279,7 @@ def bound(path: Path, feed: dict[str, np.ndarray]) -> Call:
 
 def _library(folder: Path) -> Path | None:
     """Compile `psi.c`; return its library, None on a machine without a C compiler."""
-    return native.build(folder) if native.compiler() else None
+    return native.build(folder) if compilers.compiler("C") else None
 
 
 def c_call(library: Path, path: Path, model: Model, vertices: bool = True) -> Call:

@@ -20,6 +20,7 @@ from clothjax.files import storage
 from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
 from clothjax.networks.baselines import inputs as baseline_inputs
+from clothjax.physics import compilers
 from clothjax.runtime import loading, specialise, trained
 from clothjax.runtime.models import ForcePredictor
 from clothjax.simulation import assembly, reference
@@ -130,7 +131,7 @@ def _psi(case: Case, run: Path, family: str, folder: Path, shapes: dict[str, flo
         f"{family}, {name} of the shapes": specialise.specialise(model, blendshapes=max(1, int(part * count)))
         for name, part in shapes.items()
     }
-    library, variants = native.build(folder) if native.compiler() else None, {}
+    library, variants = native.build(folder) if compilers.compiler("C") else None, {}
     for name, form in forms.items():
         for int8 in (False, True):
             path = onnx.to_onnx(form, folder / f"{len(variants)}.onnx", int8=int8)

@@ -12,8 +12,8 @@ import pytest
 from toy import small
 
 from clothjax.config import Config
-from clothjax.export import native
 from clothjax.files import configuration
+from clothjax.physics import compilers
 from experiments.benchmark import (
     baselines,
     comparison,
@@ -84,7 +84,7 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
     rest = figures["resting"]
     assert rest["frames_moving"] < rest["frames_taken"] < rest["frames"] and 0 < rest["error_mm_max"] < 1.0
     assert figures["forces"]["us"][f"{inference.FORCED}: onnx"] > figures["forces"]["us"][f"{inference.SHIPPED}: onnx"]
-    if native.compiler():
+    if compilers.compiler("C"):
         assert variants["C: folded"]["error_mm"] < variants["folded, int8"]["error_mm"]
 
 

@@ -18,12 +18,12 @@ from toy import assert_same, small
 
 from clothjax.body import skinning
 from clothjax.commands import convert
-from clothjax.export import frame, litert, native, onnx, onnx_drape, onnx_forces, safetensors, stablehlo
+from clothjax.export import frame, litert, onnx, onnx_drape, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import storage
 from clothjax.geometry import clusters
 from clothjax.networks import forces
-from clothjax.physics import relaxation
+from clothjax.physics import compilers, relaxation
 from clothjax.runtime import drape, inference, specialise
 from clothjax.types import Material, Motion, Pose
 
@@ -203,7 +203,7 @@ def test_the_web_runtime_agrees_over_300_frames(model, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(
-    native.compiler() is None or shutil.which("go") is None,
+    compilers.compiler("C") is None or shutil.which("go") is None,
     reason="needs a C compiler, and Go to fetch ONNX Runtime's header",
 )
 def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
@@ -214,7 +214,8 @@ def test_a_program_in_c_drives_the_file_over_300_frames(model, tmp_path):
     (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
     (tmp_path / "libonnxruntime.so.1").symlink_to(library)
     source = ROOT / "experiments" / "deploy" / "play_onnx.c"
-    command = [native.compiler(), "-std=c99", "-O2", "-Wall", "-Werror", "-isystem", json.loads(got.stdout)["Dir"]]
+    header = json.loads(got.stdout)["Dir"]
+    command = [compilers.compiler("C"), "-std=c99", "-O2", "-Wall", "-Werror", "-isystem", header]
     program = tmp_path / "play_onnx"
     command += [source, tmp_path / "libonnxruntime.so.1", f"-Wl,-rpath,{tmp_path}", "-o", program]
     subprocess.run(command, check=True)

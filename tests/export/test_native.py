@@ -20,19 +20,19 @@ from clothjax.export import native, onnx, psi_ffi
 from clothjax.files import storage
 from clothjax.geometry import clusters
 from clothjax.networks import forces
-from clothjax.physics import contact_search, relaxation
+from clothjax.physics import compilers, contact_search, relaxation
 from clothjax.runtime import drape, inference, models, specialise
 from clothjax.runtime.models import Layer, State
 from clothjax.types import Material, Pose
 
-pytestmark = pytest.mark.skipif(native.compiler() is None, reason="needs a C compiler")
+pytestmark = pytest.mark.skipif(compilers.compiler("C") is None, reason="needs a C compiler")
 PLAY = ROOT / "experiments" / "deploy" / "play.c"
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    return native.build(tmp_path_factory.mktemp("psi"), (*native.FLAGS, "-Wall", "-Wextra", "-Werror"))
+    return native.build(tmp_path_factory.mktemp("psi"), (*compilers.FLAGS, "-Wall", "-Wextra", "-Werror"))
 
 
 def rounded(model):
@@ -400,7 +400,7 @@ def made(folder, *flags, source=PLAY):
     """The example program, or another one."""
     program = folder / "play"
     sources = (source, native.SOURCES[1])
-    command = [native.compiler(), *flags, f"-I{native.SOURCES[0].parent}", *sources, "-lm", "-o", program]
+    command = [compilers.compiler("C"), *flags, f"-I{native.SOURCES[0].parent}", *sources, "-lm", "-o", program]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode and "-fsanitize=address,undefined" in flags:
         pytest.skip(f"no sanitizers here: {done.stderr[:200]}")
@@ -422,10 +422,10 @@ def test_what_convert_leaves_is_all_an_engine_needs(model, motion, tmp_path, cap
     shutil.copy(PLAY, out.parent)
     program = out.parent / "play"
     command = [
-        native.compiler(),
+        compilers.compiler("C"),
         "-std=c99",
         "-pedantic-errors",
-        *native.FLAGS,
+        *compilers.FLAGS,
         "play.c",
         "psi.c",
         "-lm",

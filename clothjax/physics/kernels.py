@@ -1,0 +1,186 @@
+"""Energies and relaxation of cloth in C++, for descents on a CPU: XLA's loops over elements take three times as long.
+
+The form in jax is the reference. All use it but functions that `in_kernels` wraps, where there is a compiler. Kernels
+are in single precision, and have derivatives by positions alone, in reverse mode alone.
+"""
+
+import contextvars
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Float
+
+from clothjax import progress
+from clothjax.physics import compilers
+from clothjax.physics.energies import THICKNESS
+from clothjax.types import Array, EdgeContact, Material, Mesh, Rest
+
+SOURCE = Path(__file__).with_suffix(".cc")
+SYMBOLS = ("ClothStretching", "ClothBending", "ClothEdgeCollision", "ClothRelax", "ClothRelaxBack")
+
+_used: contextvars.ContextVar[bool] = contextvars.ContextVar("kernels", default=False)
+
+
+def in_kernels(function: Callable) -> Callable:
+    """Return a function that is traced with kernels; on a machine that cannot build them, which is told, as it is."""
+
+    @functools.wraps(function)
+    def wrapped(*arguments):
+        before = _used.set(_built())
+        try:
+            return function(*arguments)
+        finally:
+            _used.reset(before)
+
+    return wrapped
+
+
+@functools.cache
+def _built() -> bool:
+    if jax.default_backend() != "cpu":
+        return False
+    try:
+        compilers.register(SOURCE, SYMBOLS)
+    except OSError as error:
+        progress.say(f"descents are left to jax, which takes longer: {error}")
+        return False
+    return True
+
+
+def used(position: Array, mesh: Mesh) -> bool:
+    """Return whether kernels compute what is traced now, of positions [V, 3] in single precision on a known mesh."""
+    known = not any(isinstance(corners, Tracer) for corners in mesh)
+    return _used.get() and known and position.dtype == jnp.float32
+
+
+class Elements(NamedTuple):
+    """Elements with k corners."""
+
+    corner: np.ndarray  # [k, n] int32, vertices
+    place: np.ndarray  # [most, V] int32: where the corners of each vertex are among all, [k n]; k n for none
+
+
+class Sheet(NamedTuple):
+    """Faces that stretch."""
+
+    inverse: Array  # [4, F] 1/m
+    weight: Array  # [F] m^3, area times thickness
+    mu: Array  # [F] Pa
+    lam: Array  # [F] Pa
+
+
+def stretching(position: Float[Array, "V 3"], rest: Rest, material: Material, mesh: Mesh) -> Float[Array, ""]:
+    """Return the sum of `energies.stretching` at positions [V, 3] m, in J."""
+    faces = elements(mesh.faces, len(position))
+    return _energy(position, (*faces, *_sheet(rest, material)), "ClothStretching")
+
+
+def bending(position: Float[Array, "V 3"], rest: Rest, material: Material, mesh: Mesh) -> Float[Array, ""]:
+    """Return the sum of `energies.bending` at positions [V, 3] m, in J."""
+    stiffness = material.bending / (8.0 * rest.hinge_area)
+    operands = (*elements(mesh.hinges, len(position)), stiffness, rest.hinge_angle)
+    return _energy(position, operands, "ClothBending")
+
+
+def edge_collision(
+    position: Float[Array, "V 3"], contact: EdgeContact, mesh: Mesh, stiffness: float, offset: float
+) -> Float[Array, ""]:
+    """Return the sum of `incremental_potential.edge_collision` at positions [V, 3] m, in J.
+
+    Args:
+        stiffness: J/m^3.
+        offset: m.
+    """
+    operands = (*elements(mesh.edges, len(position)), contact.place, contact.point_next.T, contact.normal_next.T)
+    return _energy(position, operands, "ClothEdgeCollision", (("stiffness", stiffness), ("offset", offset)))
+
+
+def elements(corners: Array, vertices: int) -> Elements:
+    """Return elements [n, k] of a mesh as the kernels read them."""
+    corner = np.ascontiguousarray(np.asarray(corners, np.int32).T)
+    order = np.argsort(corner.reshape(-1), kind="stable")
+    vertex = corner.reshape(-1)[order]
+    place = np.full((np.bincount(vertex).max(initial=0), vertices), corner.size, np.int32)
+    place[np.arange(len(vertex)) - np.searchsorted(vertex, vertex), vertex] = order
+    return Elements(corner, place)
+
+
+def _sheet(rest: Rest, material: Material) -> Sheet:
+    inverse, weight = rest.inverse.reshape(-1, 4).T, rest.face_area * np.float32(THICKNESS)
+    return Sheet(
+        inverse,
+        weight,
+        *(jnp.broadcast_to(jnp.asarray(x, weight.dtype), weight.shape) for x in (material.mu, material.lam)),
+    )
+
+
+Settings = tuple[tuple[str, float], ...]
+
+
+def _call(name: str, shapes: list[tuple[int, ...]], *operands: Array, **attributes: np.generic) -> Sequence[Array]:
+    kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    # operands that all garments of a batch share are not copied
+    return jax.ffi.ffi_call(name, kinds, vmap_method="expand_dims")(*operands, **attributes)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _energy(position: Array, operands: tuple, name: str, settings: Settings = ()) -> Array:
+    return _energy_forward(position, operands, name, settings)[0]
+
+
+def _energy_forward(position: Array, operands: tuple, name: str, settings: Settings) -> tuple[Array, Array]:
+    attributes = {key: np.float32(value) for key, value in settings}
+    energy, gradient = _call(name, [(), position.shape[::-1]], position.T, *operands, **attributes)
+    return energy, gradient
+
+
+def _energy_backward(_name: str, _settings: Settings, gradient: Array, cotangent: Array) -> tuple[Array, None]:
+    return cotangent * gradient.T, None
+
+
+_energy.defvjp(_energy_forward, _energy_backward)
+
+
+def relaxed(
+    position: Float[Array, "V 3"],
+    mobility: Float[Array, " V"],
+    rest: Rest,
+    material: Material,
+    mesh: Mesh,
+    steps: int,
+    longest: float,
+) -> Float[Array, "V 3"]:
+    """Return what `relaxation.relaxed` does.
+
+    Args:
+        longest: m, that a vertex moves in a step at most.
+    """
+    faces = elements(mesh.faces, len(position))
+    return _relaxed(position, (mobility, *faces, *_sheet(rest, material)), steps, longest)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _relaxed(position: Array, operands: tuple, steps: int, longest: float) -> Array:
+    return _relaxed_forward(position, operands, steps, longest)[0]
+
+
+def _relaxed_forward(position: Array, operands: tuple, steps: int, longest: float) -> tuple[Array, tuple]:
+    rows, settings = position.T, {"longest": np.float32(longest), "steps": np.int32(steps)}
+    (after,) = _call("ClothRelax", [(steps, *rows.shape)], rows, *operands, **settings)
+    return after[-1].T, (rows, after, operands)
+
+
+def _relaxed_backward(steps: int, longest: float, passed: tuple, cotangent: Array) -> tuple[Array, None]:
+    rows, after, operands = passed
+    settings = {"longest": np.float32(longest), "steps": np.int32(steps)}
+    (by,) = _call("ClothRelaxBack", [rows.shape], cotangent.T, rows, after, *operands, **settings)
+    return by.T, None
+
+
+_relaxed.defvjp(_relaxed_forward, _relaxed_backward)
