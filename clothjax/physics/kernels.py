@@ -28,11 +28,16 @@ _used: contextvars.ContextVar[bool] = contextvars.ContextVar("kernels", default=
 
 
 def in_kernels(function: Callable) -> Callable:
-    """Return a function that is traced with kernels; on a machine that cannot build them, which is told, as it is."""
+    """Return a function that is traced with kernels; on a machine that cannot build them, which is told, as it is.
+
+    They are built here, not while it is traced: several threads may do that at once.
+    """
+    if not _built():
+        return function
 
     @functools.wraps(function)
     def wrapped(*arguments):
-        before = _used.set(_built())
+        before = _used.set(True)
         try:
             return function(*arguments)
         finally:
