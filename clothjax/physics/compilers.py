@@ -1,10 +1,10 @@
 """This machine's compilers, and functions in C++ that XLA calls: built when a process first needs them."""
 
 import ctypes
-import functools
 import shutil
 import subprocess
 import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +12,9 @@ import jax
 
 PROGRAMS = {"C": ("cc", "gcc", "clang"), "C++": ("c++", "g++", "clang++")}
 FLAGS = ("-O3", "-march=native")
+
+_registered: set[str] = set()
+_one_at_a_time = threading.Lock()  # a name cannot be registered twice
 
 
 def compiler(language: str) -> str | None:
@@ -34,7 +37,6 @@ def run(language: str, arguments: Sequence[str | Path]) -> None:
         raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
 
 
-@functools.cache
 def register(source: Path, names: tuple[str, ...], plain: Path | None = None) -> None:
     """Compile handlers of `jax.ffi` for the CPU and register them by their names, once a process.
 
@@ -45,13 +47,17 @@ def register(source: Path, names: tuple[str, ...], plain: Path | None = None) ->
     Raises:
         OSError: if a compiler is missing or fails.
     """
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        library, objects = Path(folder) / f"lib{source.stem}.so", []
-        if plain is not None:
-            objects = [Path(folder) / f"{plain.stem}.o"]
-            run("C", [*FLAGS, "-fPIC", "-c", plain, "-o", *objects])
-        include = f"-isystem{jax.ffi.include_dir()}"
-        run("C++", ["-std=c++17", *FLAGS, "-fPIC", "-shared", include, source, *objects, "-o", library])
-        handlers = ctypes.CDLL(str(library))  # it stays loaded when its file is gone
-    for name in names:
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(handlers, name)), platform="cpu")
+    with _one_at_a_time:
+        if _registered.issuperset(names):
+            return
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            library, objects = Path(folder) / f"lib{source.stem}.so", []
+            if plain is not None:
+                objects = [Path(folder) / f"{plain.stem}.o"]
+                run("C", [*FLAGS, "-fPIC", "-c", plain, "-o", *objects])
+            include = f"-isystem{jax.ffi.include_dir()}"
+            run("C++", ["-std=c++17", *FLAGS, "-fPIC", "-shared", include, source, *objects, "-o", library])
+            handlers = ctypes.CDLL(str(library))  # it stays loaded when its file is gone
+        for name in names:
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(handlers, name)), platform="cpu")
+        _registered.update(names)

@@ -2,10 +2,12 @@
 //
 // Positions are rows [3][V]. Loops over elements first write the gradients at all corners, [3][k elements + 1]; then
 // loops over vertices add up those of their own corners, which `place` [most][V] names. The last entry of a row is zero:
-// it is named by vertices with fewer corners than others. So no loop scatters, and all become vectors.
+// it is named by vertices with fewer corners than others. So none of these loops scatters, and they become vectors.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <initializer_list>
+#include <utility>
 #include <vector>
 
 #include "xla/ffi/api/ffi.h"
@@ -251,10 +253,20 @@ static void relax_back(const Sheet &s, const float *mobility, float longest, con
   for (size_t v = 0; v < 3 * V; v++) by[v] += g[v];
 }
 
-// The garments of a batch that jax.vmap made. An operand that they share has an axis of 1, or none.
+// The garments of a batch that one jax.vmap made. An operand that they share has an axis of 1, or none.
 static const float *row(const Floats &of, size_t length, size_t index) {
   return of.typed_data() + (of.element_count() == length ? 0 : index * length);
 }
+
+using Lengths = std::initializer_list<std::pair<const Floats *, size_t>>;
+
+static bool fit(size_t count, Lengths operands) {
+  for (auto [of, length] : operands)
+    if (of->element_count() != length && of->element_count() != count * length) return false;
+  return true;
+}
+
+static ffi::Error unfit() { return ffi::Error::InvalidArgument("kernels of cloth take batches of one jax.vmap"); }
 
 template <typename Buffer>
 static size_t from_last(const Buffer &of, size_t back) {
@@ -274,9 +286,10 @@ static Sheet sheet(const Elements &of, const Floats &inverse, const Floats &weig
 static ffi::Error Stretching(Floats x, Integers corner, Integers place, Floats inverse, Floats weight, Floats mu,
                              Floats lam, Result energy, Result gradient) {
   const Elements faces = elements(corner, place);
-  const size_t size = 3 * faces.vertices;
-  std::vector<float> corners(3 * (3 * faces.count + 1));
-  for (size_t b = 0; b < energy->element_count(); b++)
+  const size_t size = 3 * faces.vertices, n = faces.count, count = energy->element_count();
+  if (!fit(count, {{&x, size}, {&inverse, 4 * n}, {&weight, n}, {&mu, n}, {&lam, n}})) return unfit();
+  std::vector<float> corners(3 * (3 * n + 1));
+  for (size_t b = 0; b < count; b++)
     energy->typed_data()[b] =
         (float)stretching(sheet(faces, inverse, weight, mu, lam, b), row(x, size, b), corners.data(),
                           gradient->typed_data() + size * b);
@@ -286,9 +299,10 @@ static ffi::Error Stretching(Floats x, Integers corner, Integers place, Floats i
 static ffi::Error Bending(Floats x, Integers corner, Integers place, Floats stiffness, Floats angle, Result energy,
                           Result gradient) {
   const Elements hinges = elements(corner, place);
-  const size_t size = 3 * hinges.vertices, n = hinges.count;
+  const size_t size = 3 * hinges.vertices, n = hinges.count, count = energy->element_count();
+  if (!fit(count, {{&x, size}, {&stiffness, n}, {&angle, n}})) return unfit();
   std::vector<float> corners(3 * (4 * n + 1));
-  for (size_t b = 0; b < energy->element_count(); b++)
+  for (size_t b = 0; b < count; b++)
     energy->typed_data()[b] = (float)bending({hinges, row(stiffness, n, b), row(angle, n, b)}, row(x, size, b),
                                              corners.data(), gradient->typed_data() + size * b);
   return ffi::Error::Success();
@@ -297,9 +311,10 @@ static ffi::Error Bending(Floats x, Integers corner, Integers place, Floats stif
 static ffi::Error EdgeCollision(Floats x, Integers corner, Integers place, Floats share, Floats point, Floats normal,
                                 float stiffness, float offset, Result energy, Result gradient) {
   const Elements edges = elements(corner, place);
-  const size_t size = 3 * edges.vertices, n = edges.count;
+  const size_t size = 3 * edges.vertices, n = edges.count, count = energy->element_count();
+  if (!fit(count, {{&x, size}, {&share, n}, {&point, 3 * n}, {&normal, 3 * n}})) return unfit();
   std::vector<float> corners(3 * (2 * n + 1));
-  for (size_t b = 0; b < energy->element_count(); b++)
+  for (size_t b = 0; b < count; b++)
     energy->typed_data()[b] = (float)edge_collision(
         edges, row(share, n, b), row(point, 3 * n, b), row(normal, 3 * n, b), stiffness, offset, row(x, size, b),
         corners.data(), gradient->typed_data() + size * b);
@@ -309,8 +324,9 @@ static ffi::Error EdgeCollision(Floats x, Integers corner, Integers place, Float
 static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Integers place, Floats inverse, Floats weight,
                         Floats mu, Floats lam, float longest, int32_t steps, Result after) {
   const Elements faces = elements(corner, place);
-  const size_t V = faces.vertices, count = after->element_count() / (3 * V * steps);
-  std::vector<float> corners(3 * (3 * faces.count + 1)), g(3 * V);
+  const size_t V = faces.vertices, n = faces.count, count = after->element_count() / (3 * V * steps);
+  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&weight, n}, {&mu, n}, {&lam, n}})) return unfit();
+  std::vector<float> corners(3 * (3 * n + 1)), g(3 * V);
   for (size_t b = 0; b < count; b++) {
     const Sheet s = sheet(faces, inverse, weight, mu, lam, b);
     const float *from = row(x, 3 * V, b);
@@ -327,8 +343,11 @@ static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats after, Floats mob
                             Floats inverse, Floats weight, Floats mu, Floats lam, float longest, int32_t steps,
                             Result by) {
   const Elements faces = elements(corner, place);
-  const size_t V = faces.vertices, count = by->element_count() / (3 * V);
-  std::vector<float> corners(3 * (3 * faces.count + 1)), g(3 * V), pushed(3 * V);
+  const size_t V = faces.vertices, n = faces.count, count = by->element_count() / (3 * V);
+  if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&after, 3 * V * steps}, {&mobility, V}, {&inverse, 4 * n},
+                   {&weight, n}, {&mu, n}, {&lam, n}}))
+    return unfit();
+  std::vector<float> corners(3 * (3 * n + 1)), g(3 * V), pushed(3 * V);
   for (size_t b = 0; b < count; b++) {
     const Sheet s = sheet(faces, inverse, weight, mu, lam, b);
     const float *passed = row(after, 3 * V * steps, b);

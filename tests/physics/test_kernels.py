@@ -1,5 +1,7 @@
 """The kernels in C++ compute what jax does."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from samples import sheet, time_step
 
 from clothjax.config import PhysicsConfig
-from clothjax.physics import compilers, incremental_potential, kernels, relaxation
+from clothjax.physics import compilers, energies, incremental_potential, kernels, relaxation
 
 needs_compilers = pytest.mark.skipif(
     None in map(compilers.compiler, compilers.PROGRAMS), reason="needs a C and a C++ compiler"
@@ -28,7 +30,11 @@ def crumpled():
     """A time step of a sheet of 400 vertices, half in the ground, bent at rest, and where its vertices go next."""
     vertices, mesh = sheet(20)
     random = np.random.default_rng(0)
-    step = time_step(vertices + 0.01 * random.normal(size=vertices.shape), mesh, vertices, ground=0.0, edges=True)
+    bent = vertices + 0.01 * random.normal(size=vertices.shape)
+    step = time_step(bent, mesh, vertices, ground=0.0, edges=True)
+    with jax.enable_x64(True):
+        step = step._replace(rest=jax.device_get(energies.rest_measures(bent, mesh, flat=False)))
+    assert np.abs(step.rest.hinge_angle).max() > 0.5
     x = vertices + 0.004 * random.normal(size=vertices.shape)
     x[5] = x[4]  # faces without area
     x[30:33] = x[30]  # in one point
@@ -75,18 +81,12 @@ def test_relaxation_and_its_derivative_are_those_of_jax(crumpled):
     np.testing.assert_array_equal(found[~free], single(x)[~free])
 
 
-@needs_compilers
-def test_garments_of_a_batch_are_as_each_alone(crumpled):
-    """Positions, measures at rest and cloth of their own, or shared."""
-    x, mesh, step = single(crumpled)
-    step = jax.tree.map(jnp.asarray, step)
-    several = x[None] + np.float32(1e-3) * np.random.default_rng(2).normal(size=(3, *x.shape)).astype(np.float32)
-    scales = jnp.array([0.5, 1.0, 2.0])
+def of_relaxed(mesh):
+    """The potential of a garment that is relaxed, its measures at rest, cloth and planes scaled; and its gradient."""
 
-    def both(x, scale):
-        rest = step.rest._replace(inverse=scale * step.rest.inverse, hinge_angle=scale * step.rest.hinge_angle)
-        cloth = step.material._replace(mu=scale * step.material.mu)
-        own = step._replace(rest=rest, material=cloth)
+    def both(x, scale, step):
+        rest, cloth, planes = jax.tree.map(lambda leaf: scale * leaf, (step.rest, step.material, step.edge_contact))
+        own = step._replace(rest=rest, material=cloth, edge_contact=planes)
         mobility = relaxation.mobility(rest, cloth, mesh, jnp.ones(len(x)))
 
         def energy(x):
@@ -94,32 +94,74 @@ def test_garments_of_a_batch_are_as_each_alone(crumpled):
 
         return jax.value_and_grad(energy)(x)
 
-    in_kernels = kernels.in_kernels(both)
-    for axes in ((0, 0), (0, None), (None, 0)):
-        arguments = [each if axis == 0 else each[0] for each, axis in zip((jnp.asarray(several), scales), axes)]
-        together = jax.jit(jax.vmap(in_kernels, axes))(*arguments)
-        for i in range(3):
-            alone = jax.jit(in_kernels)(*(each[i] if axis == 0 else each for each, axis in zip(arguments, axes)))
-            for one, other in zip(alone, together):
-                np.testing.assert_allclose(one, other[i], rtol=1e-6, atol=1e-6 * np.abs(one).max())
+    return kernels.in_kernels(both)
 
 
-def test_jax_computes_what_kernels_cannot(crumpled, monkeypatch, capsys):
+@needs_compilers
+@pytest.mark.parametrize("axes", [(0, 0), (0, None), (None, 0)])
+def test_garments_of_a_batch_are_as_each_alone(crumpled, axes):
+    """Positions, and all that energies read, of their own or shared."""
+    x, mesh, step = single(crumpled)
+    step = jax.tree.map(jnp.asarray, step)
+    several = x[None] + np.float32(1e-3) * np.random.default_rng(2).normal(size=(3, *x.shape)).astype(np.float32)
+    arguments = [
+        each if axis == 0 else each[0]
+        for each, axis in zip((jnp.asarray(several), jnp.array([0.5, 1.0, 2.0])), axes, strict=True)
+    ]
+    both = of_relaxed(mesh)
+    together = jax.jit(jax.vmap(both, (*axes, None)))(*arguments, step)
+    for i in range(3):
+        one = [each[i] if axis == 0 else each for each, axis in zip(arguments, axes, strict=True)]
+        for alone, found in zip(jax.jit(both)(*one, step), together, strict=True):
+            np.testing.assert_allclose(alone, found[i], rtol=1e-5, atol=1e-5 * np.abs(alone).max())
+
+
+@needs_compilers
+def test_what_kernels_do_not_have_is_refused(crumpled):
+    """Batches of batches, and derivatives by anything but positions."""
+    x, mesh, step = single(crumpled)
+    step = jax.tree.map(jnp.asarray, step)
+    both = jax.vmap(jax.vmap(of_relaxed(mesh), (0, None, None)), (None, 0, None))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="batches of one"):
+        jax.block_until_ready(jax.jit(both)(jnp.stack([x, x]), jnp.ones(3), step))
+
+    def by_stiffness(mu):
+        return potential(mesh)(x, step._replace(material=step.material._replace(mu=mu)))
+
+    assert jax.grad(by_stiffness)(jnp.float32(1e4)) > 0
+    with pytest.raises(NotImplementedError, match="derivatives by positions alone"):
+        jax.grad(kernels.in_kernels(by_stiffness))(jnp.float32(1e4))
+
+
+@needs_compilers
+def test_jax_computes_what_kernels_cannot(crumpled):
     x, mesh, step = crumpled
     with jax.enable_x64(True):  # in double precision
-        traced = jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step)
-        assert "ffi_call" not in str(traced)
+        assert "ffi_call" not in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
     x, step = single((x, step))
     unknown = jax.make_jaxpr(kernels.in_kernels(lambda x, step, mesh: potential(mesh)(x, step)))(x, step, mesh)
     assert "ffi_call" not in str(unknown)
+    assert "ffi_call" in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
     assert "ffi_call" not in str(jax.make_jaxpr(potential(mesh))(x, step))  # not wrapped
+
+
+@pytest.mark.parametrize(
+    "programs, told",
+    [({"C": "cc", "C++": None}, "no compiler for C++ on the path: install gcc or clang"),
+     ({"C": "cc", "C++": sys.executable}, "failed: ")],
+)  # fmt: skip
+def test_without_a_compiler_that_works_jax_computes_all(crumpled, monkeypatch, capsys, programs, told):
+    x, mesh, step = single(crumpled)
+    monkeypatch.setattr(compilers, "compiler", programs.get)
+    monkeypatch.setattr(compilers, "_registered", set())
     kernels._built.cache_clear()
-    monkeypatch.setattr(compilers, "compiler", lambda language: None)
-    compilers.register.cache_clear()
-    for _ in range(2):
-        assert "ffi_call" not in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
-    assert capsys.readouterr().out.count("no compiler for C++ on the path: install gcc or clang") == 1
-    kernels._built.cache_clear()
+    try:
+        for _ in range(2):
+            assert "ffi_call" not in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
+    finally:
+        kernels._built.cache_clear()
+    out = capsys.readouterr().out
+    assert out.count("descents are left to jax, which takes longer: ") == 1 and told in out and out.count("\n") == 1
 
 
 def test_where_the_corners_of_a_vertex_are():

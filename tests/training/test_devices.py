@@ -149,7 +149,7 @@ print(len(jax.devices()), "devices")
 for one, four in zip(jax.tree.leaves(after[0][0]), jax.tree.leaves(after[1][0]), strict=True):
     np.testing.assert_allclose(one, four, rtol=1e-5, atol=5e-5)
 for one, four in zip(jax.tree.leaves(after[0][1]), jax.tree.leaves(after[1][1]), strict=True):
-    np.testing.assert_allclose(one, four, rtol=0, atol=1e-4 * np.abs(one).max())
+    np.testing.assert_allclose(one, four, rtol=0, atol=1e-3 * np.abs(one).max())
 for one, four in zip(teachers[0], teachers[1], strict=True):
     np.testing.assert_allclose(one, four, rtol=0, atol=3e-3 * max(1.0, np.abs(one).max()))
 """
@@ -166,7 +166,7 @@ def test_a_batch_of_any_stage_that_cannot_be_divided_is_refused_before_training(
 
 @pytest.mark.slow
 def test_four_devices_take_the_step_of_one(config):
-    """Gradients to 1e-4: Adam turns the rounding of one near zero into a part of its step. Teachers likewise."""
+    """Gradients to 1e-3, as rounding may switch a ReLU: Adam turns the rounding of one near zero into a part of its step. Teachers likewise."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     done = subprocess.run(
         [sys.executable, "-c", ONE_AND_FOUR, str(config)], capture_output=True, text=True, cwd=ROOT, env=environment

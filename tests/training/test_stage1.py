@@ -132,7 +132,8 @@ def test_phi_does_not_see_place_or_heading(toy, update):
     heading = steps(elsewhere, _windows(turned))
     error = np.abs(heading - moved(steps(states, _windows(motion)))).max(axis=(1, 2))
     # where two steps of a line search are as good, rounding chooses: in none or one of 19 frames, over two seeds
-    assert np.sort(error)[-4] < 2e-5, error
+    assert np.isfinite(error).all() and np.sort(error)[-3] < 5e-5, error
+    np.testing.assert_allclose(play(_windows(turned))[0][0], moved(plain[0]), atol=2e-6)  # as it settles, too
 
 
 def _windows(motion):
