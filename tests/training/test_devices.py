@@ -166,7 +166,7 @@ def test_a_batch_of_any_stage_that_cannot_be_divided_is_refused_before_training(
 
 @pytest.mark.slow
 def test_four_devices_take_the_step_of_one(config):
-    """Gradients to 1e-3, as rounding may switch a ReLU: Adam turns the rounding of one near zero into a part of its step. Teachers likewise."""
+    """Gradients, as Adam turns the rounding of one near zero into a part of its step. Rounding may switch a ReLU."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     done = subprocess.run(
         [sys.executable, "-c", ONE_AND_FOUR, str(config)], capture_output=True, text=True, cwd=ROOT, env=environment
