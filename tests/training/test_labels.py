@@ -17,7 +17,7 @@ from clothjax.geometry.proximity import nearest_point
 from clothjax.material import material_inputs
 from clothjax.networks import animators, forces, phi
 from clothjax.networks.psi import ForcePsi
-from clothjax.physics import contact_search, descent, incremental_potential
+from clothjax.physics import compilers, contact_search, descent, incremental_potential, kernels
 from clothjax.physics.energies import GRAVITY
 from clothjax.runtime import inference, loading, trained
 from clothjax.simulation import assembly, characters, rollout, time_step
@@ -245,6 +245,19 @@ def test_labels_are_the_same_of_several_simulations_in_one_program(toy, finished
     assert made[0][2] == labels.sampling.ON_CPU
     np.testing.assert_allclose(together.labels.held[::5], finished.labels.held[::5], rtol=1e-3)
     np.testing.assert_allclose(together.labels.least[::5], finished.labels.least[::5], rtol=1e-2, atol=1e-4)
+
+
+@pytest.mark.skipif(None in map(compilers.compiler, compilers.PROGRAMS), reason="needs a C and a C++ compiler")
+def test_labels_are_made_with_kernels(toy, monkeypatch):
+    experiment, clips, params, state = toy
+    config = dataclasses.replace(experiment.config, model=dataclasses.replace(experiment.config.model, relaxation=2))
+    made = []
+    monkeypatch.setattr(labels.sampling, "make_sampler", lambda segment, *_, **__: made.append(segment))
+    labels.make_collect(experiment.scene, clips, config)
+    one = labels.begin_one(jax.random.key(5), experiment.scene, clips, config)
+    policy = labels.Policy(state.params, state.normalizers, params["garment"], params["inverse_hessian"])
+    program = str(jax.make_jaxpr(made[0])((jax.random.key(7), one), policy, clips))
+    assert [name for name in kernels.SYMBOLS if name not in program] == []
 
 
 def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finished):
