@@ -118,11 +118,8 @@ def elements(corners: Array, vertices: int) -> Elements:
 
 def _sheet(rest: Rest, material: Material) -> Sheet:
     inverse, weight = rest.inverse.reshape(-1, 4).T, rest.face_area * np.float32(THICKNESS)
-    return Sheet(
-        inverse,
-        weight,
-        *(jnp.broadcast_to(jnp.asarray(x, weight.dtype), weight.shape) for x in (material.mu, material.lam)),
-    )
+    mu, lam = (jnp.broadcast_to(jnp.asarray(x, weight.dtype), weight.shape) for x in (material.mu, material.lam))
+    return Sheet(inverse, weight, mu, lam)
 
 
 Settings = tuple[tuple[str, float], ...]
