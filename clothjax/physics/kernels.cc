@@ -70,6 +70,29 @@ static void assemble(const Elements &of, size_t wide, const float *__restrict co
     }
 }
 
+struct Columns {
+  float ux, uy, uz, vx, vy, vz;
+};
+
+// The deformation gradient of a face, or its change where x, y and z move.
+static inline Columns deformed(const float *x, const float *y, const float *z, int32_t p, int32_t q, int32_t r, float a,
+                               float b, float c, float d) {
+  const float lx = x[p] - x[r], ly = y[p] - y[r], lz = z[p] - z[r];
+  const float mx = x[q] - x[r], my = y[q] - y[r], mz = z[q] - z[r];
+  return {a * lx + c * mx, a * ly + c * my, a * lz + c * mz, b * lx + d * mx, b * ly + d * my, b * lz + d * mz};
+}
+
+// The gradient of a face at its corners: (p, q) is the first Piola-Kirchhoff stress, or its change.
+static inline void to_corners(float *corners, size_t n, float a, float b, float c, float d, Columns stress) {
+  const size_t wide = 3 * n + 1;
+  const auto [px, py, pz, qx, qy, qz] = stress;
+  const float gx = a * px + b * qx, gy = a * py + b * qy, gz = a * pz + b * qz;
+  const float hx = c * px + d * qx, hy = c * py + d * qy, hz = c * pz + d * qz;
+  corners[0] = gx, corners[n] = hx, corners[2 * n] = -gx - hx;
+  corners[wide] = gy, corners[wide + n] = hy, corners[wide + 2 * n] = -gy - hy;
+  corners[2 * wide] = gz, corners[2 * wide + n] = hz, corners[2 * wide + 2 * n] = -gz - hz;
+}
+
 // Saint Venant-Kirchhoff: its energy, and its gradient [3][V]; `corners` is room for 3 (3 faces + 1) numbers.
 static double stretching(const Sheet &s, const float *__restrict x, float *__restrict corners, float *gradient) {
   const size_t n = s.faces.count, V = s.faces.vertices, wide = 3 * n + 1;
@@ -82,11 +105,8 @@ static double stretching(const Sheet &s, const float *__restrict x, float *__res
 #pragma GCC ivdep
     for (size_t i = begin; i < end; i++) {
       const int32_t p = first[i], q = second[i], r = third[i];
-      const float lx = x[p] - x[r], ly = y[p] - y[r], lz = z[p] - z[r];
-      const float mx = x[q] - x[r], my = y[q] - y[r], mz = z[q] - z[r];
       const float a = inverse[i], b = inverse[n + i], c = inverse[2 * n + i], d = inverse[3 * n + i];
-      const float ux = a * lx + c * mx, uy = a * ly + c * my, uz = a * lz + c * mz;
-      const float vx = b * lx + d * mx, vy = b * ly + d * my, vz = b * lz + d * mz;
+      const auto [ux, uy, uz, vx, vy, vz] = deformed(x, y, z, p, q, r, a, b, c, d);
       const float along = 0.5f * (ux * ux + uy * uy + uz * uz - 1.0f), shear = 0.5f * (ux * vx + uy * vy + uz * vz);
       const float across = 0.5f * (vx * vx + vy * vy + vz * vz - 1.0f), trace = along + across;
       const float mu = mus[i], lam = lams[i], w = weights[i];
@@ -96,11 +116,7 @@ static double stretching(const Sheet &s, const float *__restrict x, float *__res
       const float s2 = w * (2.0f * mu * across + lam * trace);
       const float px = s0 * ux + s1 * vx, py = s0 * uy + s1 * vy, pz = s0 * uz + s1 * vz;
       const float qx = s1 * ux + s2 * vx, qy = s1 * uy + s2 * vy, qz = s1 * uz + s2 * vz;
-      const float gx = a * px + b * qx, gy = a * py + b * qy, gz = a * pz + b * qz;
-      const float hx = c * px + d * qx, hy = c * py + d * qy, hz = c * pz + d * qz;
-      corners[i] = gx, corners[n + i] = hx, corners[2 * n + i] = -gx - hx;
-      corners[wide + i] = gy, corners[wide + n + i] = hy, corners[wide + 2 * n + i] = -gy - hy;
-      corners[2 * wide + i] = gz, corners[2 * wide + n + i] = hz, corners[2 * wide + 2 * n + i] = -gz - hz;
+      to_corners(corners + i, n, a, b, c, d, {px, py, pz, qx, qy, qz});
     }
     for (float part : parts) energy += part;
   }
@@ -120,14 +136,8 @@ static void stretching_along(const Sheet &s, const float *__restrict x, const fl
   for (size_t i = 0; i < n; i++) {
     const int32_t p = first[i], q = second[i], r = third[i];
     const float a = inverse[i], b = inverse[n + i], c = inverse[2 * n + i], d = inverse[3 * n + i];
-    const float lx = x[p] - x[r], ly = y[p] - y[r], lz = z[p] - z[r];
-    const float mx = x[q] - x[r], my = y[q] - y[r], mz = z[q] - z[r];
-    const float ux = a * lx + c * mx, uy = a * ly + c * my, uz = a * lz + c * mz;
-    const float vx = b * lx + d * mx, vy = b * ly + d * my, vz = b * lz + d * mz;
-    const float dlx = e[p] - e[r], dly = f[p] - f[r], dlz = g[p] - g[r];
-    const float dmx = e[q] - e[r], dmy = f[q] - f[r], dmz = g[q] - g[r];
-    const float dux = a * dlx + c * dmx, duy = a * dly + c * dmy, duz = a * dlz + c * dmz;
-    const float dvx = b * dlx + d * dmx, dvy = b * dly + d * dmy, dvz = b * dlz + d * dmz;
+    const auto [ux, uy, uz, vx, vy, vz] = deformed(x, y, z, p, q, r, a, b, c, d);
+    const auto [dux, duy, duz, dvx, dvy, dvz] = deformed(e, f, g, p, q, r, a, b, c, d);
     const float along = 0.5f * (ux * ux + uy * uy + uz * uz - 1.0f), shear = 0.5f * (ux * vx + uy * vy + uz * vz);
     const float across = 0.5f * (vx * vx + vy * vy + vz * vz - 1.0f);
     const float d0 = ux * dux + uy * duy + uz * duz, d2 = vx * dvx + vy * dvy + vz * dvz;
@@ -139,11 +149,7 @@ static void stretching_along(const Sheet &s, const float *__restrict x, const fl
     const float px = s0 * dux + s1 * dvx + t0 * ux + t1 * vx, qx = s1 * dux + s2 * dvx + t1 * ux + t2 * vx;
     const float py = s0 * duy + s1 * dvy + t0 * uy + t1 * vy, qy = s1 * duy + s2 * dvy + t1 * uy + t2 * vy;
     const float pz = s0 * duz + s1 * dvz + t0 * uz + t1 * vz, qz = s1 * duz + s2 * dvz + t1 * uz + t2 * vz;
-    const float gx = a * px + b * qx, gy = a * py + b * qy, gz = a * pz + b * qz;
-    const float hx = c * px + d * qx, hy = c * py + d * qy, hz = c * pz + d * qz;
-    corners[i] = gx, corners[n + i] = hx, corners[2 * n + i] = -gx - hx;
-    corners[wide + i] = gy, corners[wide + n + i] = hy, corners[wide + 2 * n + i] = -gy - hy;
-    corners[2 * wide + i] = gz, corners[2 * wide + n + i] = hz, corners[2 * wide + 2 * n + i] = -gz - hz;
+    to_corners(corners + i, n, a, b, c, d, {px, py, pz, qx, qy, qz});
   }
   for (size_t c = 0; c < 3; c++) corners[c * wide + 3 * n] = 0.0f;
   assemble(s.faces, wide, corners, product);
