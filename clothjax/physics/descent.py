@@ -1,4 +1,8 @@
-"""Descent of the potential by L-BFGS (METHOD.md, Descent; Nocedal & Wright, Numerical Optimization, algorithm 7.4)."""
+"""Descent of the potential by L-BFGS (METHOD.md, Descent).
+
+Nocedal & Wright, Numerical Optimization, algorithm 7.4, without its loops: both are triangular systems (Byrd, Nocedal &
+Schnabel 1994, Representations of quasi-Newton matrices).
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -24,9 +28,10 @@ class _Iterate(NamedTuple):
     gradient: Array  # [L]
     direction: Array  # [L] to the code that is tried next, and ...
     share: Array  # ... how far to go along it
-    moves: Array  # [M, L] changes of the code, newest first, ...
+    moves: Array  # [M, L] changes of the code, ...
     turns: Array  # [M, L] ... of the gradient, and ...
-    weights: Array  # [M] ... one over their products; 0 for no step
+    products: Array  # [M, M] ... the product of a move with a turn as old or newer; zero where there was no step
+    newest: Array  # row of the last step; those before it go before it, in a ring
 
 
 Precondition = Callable[[Array], Array]
@@ -36,25 +41,30 @@ Objective = Callable[[Array], tuple[Array, Array]]
 def _direction(at: _Iterate, precondition: Precondition, bound: float) -> Array:
     """Return the quasi-Newton direction [L], no longer than `bound`."""
 
-    def backward(rest: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        move, turn, weight = step
-        along = weight * jnp.sum(move * rest)
-        return rest - along * turn, along
-
-    def forward(new: Array, step: tuple[tuple[Array, Array, Array], Array]) -> tuple[Array, None]:
-        (move, turn, weight), along = step
-        return new + (along - weight * jnp.sum(turn * new)) * move, None
-
-    steps = (at.moves, at.turns, at.weights)
-    rest, along = jax.lax.scan(backward, at.gradient, steps)
-    turn = at.turns[0]
+    order = (at.newest - jnp.arange(MEMORY, dtype=jnp.int32)) % MEMORY  # newest first, from the ring and into it
+    products = at.products[order][:, order]
+    curvature = jnp.diagonal(products)
+    lower = jnp.tril(products) + jnp.diag(jnp.where(curvature > 0, 0.0, 1.0))
+    along = _solved(lower, _times(at.moves, at.gradient)[order])
+    rest = at.gradient - _times(along[order], at.turns)
+    turn = at.turns[at.newest]
     # both at once: where the matrix is large, reading it is what takes time
     of_turn, of_rest = jax.vmap(precondition)(jnp.stack([turn, rest]))
-    scale = jnp.sum(at.moves[0] * turn) / jnp.maximum(jnp.sum(turn * of_turn), 1e-20)
-    scale = jnp.where(at.weights[0] > 0, jnp.clip(scale, *SCALE), 1.0)
-    new, _ = jax.lax.scan(forward, scale * of_rest, (steps, along), reverse=True)
+    scale = curvature[0] / jnp.maximum(jnp.sum(turn * of_turn), 1e-20)
+    of_rest = jnp.where(curvature[0] > 0, jnp.clip(scale, *SCALE), 1.0) * of_rest
+    back = _solved(lower, curvature * along - _times(at.turns, of_rest)[order], transposed=True)
+    new = of_rest + _times(back[order], at.moves)
     # deep collisions push thousands of times harder than the rest
     return -new / jnp.sqrt(1.0 + jnp.sum(new * new) / bound**2)
+
+
+def _times(first: Array, second: Array) -> Array:
+    return jnp.matmul(first, second, precision="highest")
+
+
+def _solved(lower: Array, right: Array, *, transposed: bool = False) -> Array:
+    settings = {"left_side": True, "lower": True, "transpose_a": transposed}
+    return jax.lax.linalg.triangular_solve(lower, right[:, None], **settings)[:, 0]
 
 
 def _first(latent: Array, objective: Objective, precondition: Precondition, bound: float) -> _Iterate:
@@ -62,7 +72,8 @@ def _first(latent: Array, objective: Objective, precondition: Precondition, boun
     energy, gradient = objective(latent)
     steps = jnp.zeros((MEMORY, len(latent)), latent.dtype)
     one = jnp.ones((), latent.dtype)
-    first = _Iterate(latent, energy, gradient, gradient, one, steps, steps, steps[:, 0])
+    products = jnp.zeros((MEMORY, MEMORY), latent.dtype)
+    first = _Iterate(latent, energy, gradient, gradient, one, steps, steps, products, jnp.int32(0))
     return first._replace(direction=_direction(first, precondition, bound))
 
 
@@ -76,16 +87,20 @@ def _step(last: _Iterate, objective: Objective, precondition: Precondition, boun
     curvature = jnp.sum(move * turn)
     convex = falls & (curvature > 1e-10 * jnp.sqrt(jnp.sum(move * move) * jnp.sum(turn * turn)))
 
-    def remembered(rows: Array, row: Array) -> Array:
-        return jnp.where(convex, jnp.concatenate([row[None], rows[:-1]]), rows)
+    row = jnp.where(convex, (last.newest + 1) % MEMORY, last.newest)
 
+    def remembered(rows: Array, new: Array) -> Array:
+        return jax.lax.dynamic_update_index_in_dim(rows, jnp.where(convex, new, rows[row]), row, 0)
+
+    moves = remembered(last.moves, move)
     there = last._replace(
         latent=jnp.where(falls, tried, last.latent),
         energy=jnp.where(falls, energy, last.energy),
         gradient=jnp.where(falls, gradient, last.gradient),
-        moves=remembered(last.moves, move),
+        moves=moves,
         turns=remembered(last.turns, turn),
-        weights=remembered(last.weights, 1.0 / jnp.where(convex, curvature, 1.0)),
+        products=remembered(last.products.T, jnp.where(jnp.arange(MEMORY) == row, curvature, _times(moves, turn))).T,
+        newest=row,
     )
     # the minimum of the parabola through both energies and the slope
     shorter = jnp.clip(-slope / (2.0 * jnp.maximum(energy - last.energy - slope, 1e-20)), *SHORTER)

@@ -1,4 +1,4 @@
-// Energies and relaxation of cloth as functions that XLA calls: see kernels.py.
+// Energies and relaxation of cloth, and a sparse solve, as functions that XLA calls: see kernels.py.
 //
 // Positions are rows [3][V]. Loops over elements first write the gradients at all corners, [3][k elements + 1]; then
 // loops over vertices add up those of their own corners, which `place` [most][V] names. The last entry of a row is zero:
@@ -18,6 +18,7 @@ using Integers = ffi::Buffer<ffi::S32>;
 using Result = ffi::ResultBuffer<ffi::F32>;
 
 constexpr size_t BLOCK = 256;      // elements whose energies are computed before they are added up
+constexpr size_t WIDE = 24;        // right-hand sides that are solved for together
 constexpr float SLIVER = 1e-6f;    // twice the area, over a hinge's squared size, below which a face has no direction
 
 struct Elements {
@@ -367,6 +368,47 @@ static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats after, Floats mob
   return ffi::Error::Success();
 }
 
+// Solves L D L^T x = b for many b [...][V][3]: the columns of L below its diagonal of ones, in the order in which vertices
+// are eliminated, and 1 / D. Vertices that are not in the order get zeros.
+static ffi::Error Solve(Floats right, Integers order, Integers start, Integers below, Floats lower, Floats pivot,
+                        Result solution) {
+  const size_t V = from_last(right, 1), n = order.element_count(), columns = right.element_count() / V;
+  if (start.element_count() != n + 1 || pivot.element_count() != n || lower.element_count() != below.element_count())
+    return unfit();
+  const int32_t *vertex = order.typed_data(), *begin = start.typed_data(), *row_of = below.typed_data();
+  const float *__restrict factor = lower.typed_data(), *inverse = pivot.typed_data();
+  std::memset(solution->typed_data(), 0, solution->size_bytes());
+  std::vector<float> room(n * WIDE);
+  float *__restrict x = room.data();
+  for (size_t first = 0; first < columns; first += WIDE) {
+    const size_t count = columns - first < WIDE ? columns - first : WIDE;
+    size_t place[WIDE];
+    for (size_t c = 0; c < count; c++) place[c] = (first + c) / 3 * 3 * V + (first + c) % 3;
+    for (size_t j = 0; j < n; j++)
+      for (size_t c = 0; c < count; c++) x[WIDE * j + c] = right.typed_data()[place[c] + 3 * (size_t)vertex[j]];
+    for (size_t j = 0; j < n; j++) {
+      float known[WIDE];
+      std::memcpy(known, x + WIDE * j, sizeof known);
+      for (int32_t p = begin[j]; p < begin[j + 1]; p++) {
+        float *to = x + WIDE * (size_t)row_of[p];
+        for (size_t c = 0; c < WIDE; c++) to[c] -= factor[p] * known[c];
+      }
+    }
+    for (size_t j = n; j-- > 0;) {
+      float sum[WIDE];
+      for (size_t c = 0; c < WIDE; c++) sum[c] = inverse[j] * x[WIDE * j + c];
+      for (int32_t p = begin[j]; p < begin[j + 1]; p++) {
+        const float *from = x + WIDE * (size_t)row_of[p];
+        for (size_t c = 0; c < WIDE; c++) sum[c] -= factor[p] * from[c];
+      }
+      std::memcpy(x + WIDE * j, sum, sizeof sum);
+    }
+    for (size_t j = 0; j < n; j++)
+      for (size_t c = 0; c < count; c++) solution->typed_data()[place[c] + 3 * (size_t)vertex[j]] = x[WIDE * j + c];
+  }
+  return ffi::Error::Success();
+}
+
 // clang-format off
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothStretching, Stretching, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
@@ -382,3 +424,5 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelax, Relax, ffi::Ffi::Bind()
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelaxBack, RelaxBack, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>()
     .Arg<Floats>().Arg<Floats>().Arg<Floats>().Attr<float>("longest").Attr<int32_t>("steps").Ret<Floats>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothSolve, Solve, ffi::Ffi::Bind()
+    .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>());

@@ -1,4 +1,4 @@
-"""Energies and relaxation of cloth in C++, for descents on a CPU: in XLA's loops over elements they take twice as long.
+"""Energies and relaxation of cloth, and a sparse solve, in C++, for descents on a CPU: XLA's loops take twice as long.
 
 The form in jax is the reference. All use it but functions that `in_kernels` wraps, where there is a compiler. Kernels
 are in single precision, and have derivatives by positions alone, in reverse mode alone.
@@ -22,7 +22,7 @@ from clothjax.physics.energies import THICKNESS
 from clothjax.types import Array, EdgeContact, Material, Mesh, Rest
 
 SOURCE = Path(__file__).with_suffix(".cc")
-SYMBOLS = ("ClothStretching", "ClothBending", "ClothEdgeCollision", "ClothRelax", "ClothRelaxBack")
+SYMBOLS = ("ClothStretching", "ClothBending", "ClothEdgeCollision", "ClothRelax", "ClothRelaxBack", "ClothSolve")
 
 _used: contextvars.ContextVar[bool] = contextvars.ContextVar("kernels", default=False)
 
@@ -32,7 +32,7 @@ def in_kernels(function: Callable) -> Callable:
 
     They are built here, not while it is traced: several threads may do that at once.
     """
-    if not _built():
+    if not built():
         return function
 
     @functools.wraps(function)
@@ -47,7 +47,8 @@ def in_kernels(function: Callable) -> Callable:
 
 
 @functools.cache
-def _built() -> bool:
+def built() -> bool:
+    """Return whether kernels are there: build them on a CPU, and tell it if that fails."""
     if jax.default_backend() != "cpu":
         return False
     try:
@@ -203,3 +204,18 @@ def _relaxed_backward(steps: int, longest: float, passed: tuple, cotangent: Arra
 
 
 _relaxed.defvjp(_relaxed_forward, _relaxed_backward, symbolic_zeros=True)
+
+
+class Factor(NamedTuple):
+    """A symmetric positive definite matrix of n of V vertices as L D L^T, sparse (Davis, Direct Methods, chapter 4)."""
+
+    order: np.ndarray  # [n] int32, the vertices in the order in which they are eliminated
+    start: np.ndarray  # [n + 1] int32, where the columns of L begin, ...
+    below: np.ndarray  # [m] int32, ... and their rows below the diagonal, in that order, ...
+    lower: np.ndarray  # [m] ... and values
+    pivot: np.ndarray  # [n] 1 / D
+
+
+def solve(factor: Factor, right: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+    """Return the inverse of a matrix times right-hand sides [V, 3]; zero for vertices that are not in it."""
+    return _call("ClothSolve", [right.shape], right, *factor)[0]

@@ -11,7 +11,7 @@ import scipy.sparse.linalg
 
 from clothjax.config import Config
 from clothjax.geometry import topology
-from clothjax.physics import energies
+from clothjax.physics import energies, kernels
 from clothjax.simulation.scene import Scene
 
 MEMBRANE = 0.25 * energies.THICKNESS  # m, of the springs that model a membrane
@@ -33,6 +33,25 @@ class Springs(NamedTuple):
     def matrix(self) -> scipy.sparse.csc_array:
         """Stiffness plus inertia, [n, n] N/m: stiffness + mass / timestep^2."""
         return (self.stiffness + scipy.sparse.diags_array(self.mass / self.timestep**2)).tocsc()
+
+    def factor(self) -> kernels.Factor:
+        """Factorise `matrix`."""
+        symmetric = {"SymmetricMode": True}
+        both = scipy.sparse.linalg.splu(self.matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+        lower = scipy.sparse.tril(both.L, -1).tocsc()
+        return kernels.Factor(
+            self.free[np.argsort(both.perm_c)].astype(np.int32),
+            lower.indptr.astype(np.int32),
+            lower.indices.astype(np.int32),
+            lower.data.astype(np.float32),
+            (1.0 / both.U.diagonal()).astype(np.float32),
+        )
+
+    def inverse(self, count: int) -> np.ndarray:
+        """Return the inverse of `matrix` among all `count` vertices, [V, V] m/N, zero for those that are pinned."""
+        inverse = np.zeros((count, count), np.float32)
+        inverse[np.ix_(self.free, self.free)] = np.linalg.inv(self.matrix.toarray())
+        return inverse
 
 
 def springs(scene: Scene, config: Config) -> Springs:

@@ -67,23 +67,25 @@ def simulate(
         folder: where they are kept, and read, if they are there.
 
     Raises:
-        ValueError: for a garment of too many vertices, or if all sequences diverged.
+        ValueError: for a garment of too many vertices where kernels cannot be built, or if all sequences diverged.
     """
     settings, network = config.shapes, laplacian_shapes.springs(scene, config)
     count = len(scene.garment.vertices)
-    if count > MAX_VERTICES:
+    if kernels.built():
+        springs = network.factor()
+    elif count > MAX_VERTICES:
         raise ValueError(
-            f"principal shapes of a garment of {count} vertices need too much memory (the most is {MAX_VERTICES}): "
-            "set shapes.sequences: 0 for smooth ones"
+            f"principal shapes of a garment of {count} vertices need too much memory without a C++ compiler, or on a "
+            f"GPU (the most is {MAX_VERTICES}): set shapes.sequences: 0 for smooth ones"
         )
-    inverse = np.zeros((count, count), np.float32)
-    inverse[np.ix_(network.free, network.free)] = np.linalg.inv(network.matrix.toarray())
+    else:
+        springs = network.inverse(count)
 
-    def sequence(key: Array, clips: Clips, inverse: Array) -> Array:
+    def sequence(key: Array, clips: Clips, springs: kernels.Factor | Array) -> Array:
         character, poses = pool.draw(key, scene, clips, config, settings.frames)
 
         def precondition(gradient):
-            return jnp.matmul(inverse, gradient.reshape(-1, 3), precision="highest").reshape(-1)
+            return _solve(springs, gradient.reshape(-1, 3)).reshape(-1)
 
         def step(inputs: StepInput) -> StepOutput:
             current, following = inputs.window.current.garment, inputs.window.following.garment
@@ -107,7 +109,7 @@ def simulate(
 
         return jax.lax.scan(frame, state, poses)[1]
 
-    arguments = (jax.tree.map(jnp.asarray, clips), jnp.asarray(inverse))
+    arguments = jax.tree.map(jnp.asarray, (clips, springs))
     keys = sampling.keys(settings.seed, settings.sequences)
     displacements = sampling.make_sampler(kernels.in_kernels(sequence), device_mesh)(keys, arguments, progress, folder)
     good = np.abs(displacements).max(axis=(1, 2, 3)) < MAX_DISPLACEMENT
@@ -117,3 +119,9 @@ def simulate(
             "or set shapes.sequences: 0 for smooth ones"
         )
     return displacements[good]
+
+
+def _solve(springs: kernels.Factor | Array, right: Array) -> Array:
+    if isinstance(springs, kernels.Factor):
+        return kernels.solve(springs, right)
+    return jnp.matmul(springs, right, precision="highest")

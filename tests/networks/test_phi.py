@@ -68,13 +68,13 @@ def test_steps_learn_the_curvature():
     assert left(8) < 0.1 and left(20) < 1e-6
 
 
-@pytest.mark.parametrize("known", [0, 1, 5])
-def test_the_direction_is_that_of_dense_bfgs(known):
+@pytest.mark.parametrize("known, newest", [(0, 0), (1, 1), (5, 3), (5, 20), (descent.MEMORY, 7)])
+def test_the_direction_is_that_of_dense_bfgs(known, newest):
     """Against the update of the whole inverse Hessian, oldest step first, begun with the scaled preconditioner."""
-    random, size = np.random.default_rng(known), 8
+    random, size = np.random.default_rng(known), 40
     mixed = random.normal(size=(2, size, size))
     hessian, inverse = mixed @ mixed.transpose(0, 2, 1) + np.eye(size)
-    inverse = inverse / 60
+    inverse = inverse / 2000
     moves, gradient = random.normal(size=(known, size)), random.normal(size=size)
     turns = moves @ hessian
     dense = inverse
@@ -84,11 +84,15 @@ def test_the_direction_is_that_of_dense_bfgs(known):
     for move, turn in zip(moves[::-1], turns[::-1], strict=True):
         part = np.eye(size) - np.outer(move, turn) / (move @ turn)
         dense = part @ dense @ part.T + np.outer(move, move) / (move @ turn)
-    empty = ((0, descent.MEMORY - known), (0, 0))
+    rows = (newest - np.arange(known)) % descent.MEMORY
     with jax.enable_x64(True):
         at = descent._first(jnp.zeros(size), lambda _: (0.0, jnp.asarray(gradient)), lambda g: inverse @ g, 1e9)
-        weights = np.pad(1 / np.sum(moves * turns, axis=1), empty[0])
-        at = at._replace(moves=np.pad(moves, empty), turns=np.pad(turns, empty), weights=weights)
+        at = at._replace(
+            moves=at.moves.at[rows].set(moves),
+            turns=at.turns.at[rows].set(turns),
+            products=at.products.at[np.ix_(rows, rows)].set(moves @ turns.T),
+            newest=jnp.int32(newest),
+        )
         found = descent._direction(jax.tree.map(jnp.asarray, at), lambda g: inverse @ g, 1e9)
     np.testing.assert_allclose(found, -dense @ gradient, rtol=1e-9)
 

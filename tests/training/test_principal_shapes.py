@@ -1,6 +1,7 @@
 """Blend shapes from freely simulated cloth."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 from toy import small
 
 from clothjax.config import ShapesConfig
+from clothjax.physics import kernels
 from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes, pipeline, principal_shapes, sampling
 
@@ -25,7 +27,11 @@ def of(experiment, **changed):
     return dataclasses.replace(experiment.config, model=dataclasses.replace(experiment.config.model, **changed))
 
 
-def test_cloth_hangs_from_its_pins(skirt):
+@pytest.mark.parametrize("built", [True, False])
+def test_cloth_hangs_from_its_pins(skirt, monkeypatch, built):
+    """With kernels, where they can be built, and without."""
+    if not built:
+        monkeypatch.setattr(kernels, "built", lambda: False)
     experiment, reel = skirt
     done = []
     frames = principal_shapes.simulate(experiment.scene, reel, experiment.config, done.append)
@@ -57,6 +63,27 @@ def test_the_components_span_what_was_simulated(skirt):
     assert np.linalg.norm(weights[0]) > np.linalg.norm(weights[2])
 
 
+@pytest.mark.skipif(not kernels.built(), reason="needs a C++ compiler")
+def test_a_solve_in_kernels_is_that_of_the_dense_inverse(skirt):
+    """For one gradient, for more than are solved for together, and for batches of batches."""
+    experiment, _ = skirt
+    springs = laplacian_shapes.springs(experiment.scene, experiment.config)
+    vertices = len(experiment.garment.vertices)
+    assert 0 < len(springs.free) < vertices
+    factor = springs.factor()
+    right = np.random.default_rng(0).normal(size=(3, 4, vertices, 3)).astype(np.float32)
+    expected = np.zeros(right.shape)
+    dense = springs.matrix.toarray()
+    expected[:, :, springs.free] = np.linalg.solve(dense, right[:, :, springs.free].astype(np.float64))
+    np.testing.assert_allclose(springs.inverse(vertices) @ right, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    for batch in ((0, 0), (slice(None), 1), (slice(None), slice(None))):
+        solve = functools.partial(kernels.solve, factor)
+        for _ in right[batch].shape[2:]:
+            solve = jax.vmap(solve)
+        found = jax.jit(solve)(right[batch])
+        np.testing.assert_allclose(found, expected[batch], rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
 def test_what_blew_up_is_left_out(skirt, monkeypatch):
     experiment, reel = skirt
     found = np.zeros((2, 5, len(experiment.garment.vertices), 3), np.float32)
@@ -66,6 +93,7 @@ def test_what_blew_up_is_left_out(skirt, monkeypatch):
     found[0, 0, 0, 0] = 9.0
     with pytest.raises(ValueError, match="look at the garment on the body"):
         principal_shapes.simulate(experiment.scene, reel, experiment.config)
+    monkeypatch.setattr(kernels, "built", lambda: False)
     monkeypatch.setattr(principal_shapes, "MAX_VERTICES", 1000)
     with pytest.raises(ValueError, match=r"shapes\.sequences: 0"):
         principal_shapes.simulate(experiment.scene, reel, experiment.config)
