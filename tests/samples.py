@@ -20,6 +20,7 @@ from toy import small
 from clothjax.config import Config, PeerConfig
 from clothjax.files import storage
 from clothjax.geometry import topology
+from clothjax.geometry.proximity import PATCH
 from clothjax.networks import decoder, forces, mlp, psi
 from clothjax.networks.normalisation import ForceScales, Normalizers, Scale
 from clothjax.physics import energies
@@ -79,6 +80,18 @@ def sheet(n=6, size=0.3):
 
 MATERIAL = Material(density=0.2, mu=23600.0, lam=44400.0, bending=3.96e-5)
 DT = 1 / 30
+
+
+def soup(random, faces, scale=1.0):
+    """Triangles [F, 3, 3] m of all shapes: slivers and segments in any direction among them; groups of strangers."""
+    shape = random.normal(size=(faces, 3, 3)) * random.choice([1e-3, 0.3], faces)[:, None, None]
+    line = shape[:, :1] + shape[:, 1:2] * random.normal(size=(faces, 3, 1))
+    thickness = random.choice([0.0, 1e-6, 1e-3], faces)[:, None, None]
+    flat = line + thickness * random.normal(size=(faces, 3, 3))
+    corners = random.normal(size=(faces, 1, 3)) + np.where(random.random((faces, 1, 1)) < 0.3, flat, shape)
+    count = -(-faces // PATCH)
+    groups = np.minimum(np.arange(count * PATCH), faces - 1).reshape(count, PATCH)
+    return (scale * corners).astype(np.float32), groups.astype(np.int32)
 
 
 def time_step(

@@ -15,6 +15,7 @@ from clothjax.geometry.proximity import (
     winding_number,
 )
 from clothjax.geometry.vectors import unit
+from clothjax.physics import kernels
 from clothjax.types import Array, Body, Contact, EdgeContact, Garment, Mesh, SelfContact
 
 ON_SURFACE = 1e-5  # m, closer than this the direction to the surface is rounding
@@ -49,7 +50,10 @@ def find(
         ahead: [V, 3] m, expected positions at the next frame; None lets every plane move along.
     """
     positions, body, body_next, patches = jax.tree.map(jnp.asarray, (positions, body, body_next, patches))
-    face = nearest_face(positions, body[patches.faces], patches.groups)
+    if kernels.used(positions):
+        face = kernels.nearest_face(positions, body, patches)
+    else:
+        face = nearest_face(positions, body[patches.faces], patches.groups)
     return _planes(positions, face, body, body_next, patches, ahead)
 
 
@@ -127,7 +131,8 @@ def find_at_edges(
     def between(x):
         return x[a] + place[:, None] * (x[b] - x[a])
 
-    face = nearest_face_around(between(positions), body, patches, [planes.index[end] for end in (a, b)])
+    search = kernels.nearest_face_around if kernels.used(positions) else nearest_face_around
+    face = search(between(positions), body, patches, [planes.index[end] for end in (a, b)])
     later = None if ahead is None else between(ahead)
     contact = _planes(between(positions), face, body, body_next, patches, later)
     return EdgeContact(place, contact.point_next, contact.normal_next)

@@ -1,4 +1,4 @@
-// Energies and relaxation of cloth, and a sparse solve, as functions that XLA calls: see kernels.py.
+// Energies and relaxation of cloth, a sparse solve and searches, as functions that XLA calls: see kernels.py.
 //
 // Positions are rows [3][V]. Loops over elements first write the gradients at all corners, [3][k elements + 1]; then
 // loops over vertices add up those of their own corners, which `place` [most][V] names. The last entry of a row is zero:
@@ -10,12 +10,14 @@
 #include <utility>
 #include <vector>
 
+#include "nearest.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
 using Floats = ffi::Buffer<ffi::F32>;
 using Integers = ffi::Buffer<ffi::S32>;
 using Result = ffi::ResultBuffer<ffi::F32>;
+using Indices = ffi::ResultBuffer<ffi::S32>;
 
 constexpr size_t BLOCK = 256;      // elements whose energies are computed before they are added up
 constexpr size_t WIDE = 24;        // right-hand sides that are solved for together
@@ -261,13 +263,13 @@ static void relax_back(const Sheet &s, const float *mobility, float longest, con
 }
 
 // The garments of a batch that one jax.vmap made. An operand that they share has an axis of 1, or none.
-static const float *row(const Floats &of, size_t length, size_t index) {
+template <typename Buffer>
+static auto row(const Buffer &of, size_t length, size_t index) {
   return of.typed_data() + (of.element_count() == length ? 0 : index * length);
 }
 
-using Lengths = std::initializer_list<std::pair<const Floats *, size_t>>;
-
-static bool fit(size_t count, Lengths operands) {
+template <typename Buffer = Floats>
+static bool fit(size_t count, std::initializer_list<std::pair<const Buffer *, size_t>> operands) {
   for (auto [of, length] : operands)
     if (of->element_count() != length && of->element_count() != count * length) return false;
   return true;
@@ -409,6 +411,36 @@ static ffi::Error Solve(Floats right, Integers order, Integers start, Integers b
   return ffi::Error::Success();
 }
 
+static Point point(const float *rows, size_t index) {
+  return {rows[3 * index], rows[3 * index + 1], rows[3 * index + 2]};
+}
+
+// The faces nearest to positions [V][3], of a body [B][3].
+static ffi::Error NearestFace(Floats x, Floats body, Integers faces, Integers groups, Indices nearest) {
+  const size_t V = from_last(x, 1), B = from_last(body, 1), count = nearest->element_count() / V;
+  if (!fit(count, {{&x, 3 * V}, {&body, 3 * B}})) return unfit();
+  for (size_t b = 0; b < count; b++) {
+    Boxes boxes(row(body, 3 * B, b), faces.typed_data(), groups.typed_data(), from_last(groups, 1),
+                from_last(groups, 0));
+    for (size_t v = 0; v < V; v++) nearest->typed_data()[V * b + v] = boxes.nearest(point(row(x, 3 * V, b), v));
+  }
+  return ffi::Error::Success();
+}
+
+// Likewise, searched for from two vertices [V] of the body each.
+static ffi::Error NearestFaceAround(Floats x, Floats body, Integers faces, Integers around, Integers first,
+                                    Integers second, Indices nearest) {
+  const size_t V = from_last(x, 1), B = from_last(body, 1), count = nearest->element_count() / V;
+  if (!fit(count, {{&x, 3 * V}, {&body, 3 * B}}) || !fit<Integers>(count, {{&first, V}, {&second, V}})) return unfit();
+  for (size_t b = 0; b < count; b++) {
+    const Fans fans(row(body, 3 * B, b), faces.typed_data(), around.typed_data(), B, from_last(around, 0));
+    const int32_t *one = row(first, V, b), *other = row(second, V, b);
+    for (size_t v = 0; v < V; v++)
+      nearest->typed_data()[V * b + v] = fans.nearest(point(row(x, 3 * V, b), v), one[v], other[v]);
+  }
+  return ffi::Error::Success();
+}
+
 // clang-format off
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothStretching, Stretching, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
@@ -426,3 +458,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelaxBack, RelaxBack, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Floats>().Arg<Floats>().Attr<float>("longest").Attr<int32_t>("steps").Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothSolve, Solve, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFace, NearestFace, ffi::Ffi::Bind()
+    .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Ret<ffi::Buffer<ffi::S32>>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFaceAround, NearestFaceAround, ffi::Ffi::Bind()
+    .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Integers>()
+    .Ret<ffi::Buffer<ffi::S32>>());

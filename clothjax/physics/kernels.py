@@ -1,4 +1,4 @@
-"""Energies and relaxation of cloth, and a sparse solve, in C++, for descents on a CPU: XLA's loops take twice as long.
+"""Energies, relaxation, a sparse solve and searches in C++, for descents on a CPU, where XLA's loops take longer.
 
 The form in jax is the reference. All use it but functions that `in_kernels` wraps, where there is a compiler. Kernels
 are in single precision, and have derivatives by positions alone, in reverse mode alone.
@@ -6,7 +6,7 @@ are in single precision, and have derivatives by positions alone, in reverse mod
 
 import contextvars
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,15 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from clothjax import progress
+from clothjax.geometry.proximity import Patches
 from clothjax.physics import compilers
 from clothjax.physics.energies import THICKNESS
 from clothjax.types import Array, EdgeContact, Material, Mesh, Rest
 
 SOURCE = Path(__file__).with_suffix(".cc")
-SYMBOLS = ("ClothStretching", "ClothBending", "ClothEdgeCollision", "ClothRelax", "ClothRelaxBack", "ClothSolve")
+ENERGIES = ("ClothStretching", "ClothBending", "ClothEdgeCollision")
+SYMBOLS = (*ENERGIES, "ClothRelax", "ClothRelaxBack", "ClothSolve", "ClothNearestFace", "ClothNearestFaceAround")
 
 _used: contextvars.ContextVar[bool] = contextvars.ContextVar("kernels", default=False)
 
@@ -59,7 +61,7 @@ def built() -> bool:
     return True
 
 
-def used(position: Array, mesh: Mesh) -> bool:
+def used(position: Array, mesh: Iterable[Array] = ()) -> bool:
     """Return whether kernels compute what is traced now, of positions [V, 3] in single precision on a known mesh."""
     known = not any(isinstance(corners, Tracer) for corners in mesh)
     return _used.get() and known and position.dtype == jnp.float32
@@ -219,3 +221,22 @@ class Factor(NamedTuple):
 def solve(factor: Factor, right: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
     """Return the inverse of a matrix times right-hand sides [V, 3]; zero for vertices that are not in it."""
     return _call("ClothSolve", [right.shape], right, *factor)[0]
+
+
+def nearest_face(positions: Float[Array, "V 3"], body: Float[Array, "B 3"], patches: Patches) -> Int[Array, " V"]:
+    """Return what `proximity.nearest_face` does, of the faces of a body."""
+    return _searched("ClothNearestFace", positions, body, patches.faces, patches.groups)
+
+
+def nearest_face_around(
+    positions: Float[Array, "V 3"], body: Float[Array, "B 3"], patches: Patches, vertices: Sequence[Array]
+) -> Int[Array, " V"]:
+    """Return what `proximity.nearest_face_around` does, from two vertices each."""
+    first, second = vertices
+    return _searched("ClothNearestFaceAround", positions, body, patches.faces, patches.around, first, second)
+
+
+def _searched(name: str, positions: Array, body: Array, *operands: Array) -> Array:
+    positions, body = jax.lax.stop_gradient((positions, body))
+    kind = jax.ShapeDtypeStruct(positions.shape[:1], jnp.int32)
+    return jax.ffi.ffi_call(name, kind, vmap_method="expand_dims")(positions, body, *operands)

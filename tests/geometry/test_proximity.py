@@ -4,7 +4,7 @@ import igl
 import jax
 import numpy as np
 import pytest
-from samples import icosphere
+from samples import icosphere, soup
 
 from clothjax.geometry import proximity
 
@@ -85,18 +85,6 @@ def test_nearest_takes_the_first_of_equals():
     points = np.array([[1, 0, 0], [-1, 0, 0], [-1, 0, 0], [1, 0, 0]], np.float32)
     positions = np.array([[0, 0, 0], [-2, 0, 0], [2, 0, 0]], np.float32)
     np.testing.assert_array_equal(proximity.nearest_point(positions, points), [0, 1, 0])
-
-
-def soup(random, faces, scale=1.0):
-    """Triangles [F, 3, 3] m of all shapes: slivers and segments in any direction among them; groups of strangers."""
-    shape = random.normal(size=(faces, 3, 3)) * random.choice([1e-3, 0.3], faces)[:, None, None]
-    line = shape[:, :1] + shape[:, 1:2] * random.normal(size=(faces, 3, 1))
-    thickness = random.choice([0.0, 1e-6, 1e-3], faces)[:, None, None]
-    flat = line + thickness * random.normal(size=(faces, 3, 3))
-    corners = random.normal(size=(faces, 1, 3)) + np.where(random.random((faces, 1, 1)) < 0.3, flat, shape)
-    count = -(-faces // proximity.PATCH)
-    groups = np.minimum(np.arange(count * proximity.PATCH), faces - 1).reshape(count, proximity.PATCH)
-    return (scale * corners).astype(np.float32), groups.astype(np.int32)
 
 
 def exact(positions, corners):

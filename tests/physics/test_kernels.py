@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from samples import sheet, time_step
+from samples import icosphere, sheet, soup, time_step
 
 from clothjax.config import PhysicsConfig
-from clothjax.physics import compilers, energies, incremental_potential, kernels, relaxation
+from clothjax.geometry import proximity
+from clothjax.physics import compilers, contact_search, energies, incremental_potential, kernels, relaxation
 
 needs_compilers = pytest.mark.skipif(
     None in map(compilers.compiler, compilers.PROGRAMS), reason="needs a C and a C++ compiler"
@@ -114,6 +115,68 @@ def test_garments_of_a_batch_are_as_each_alone(crumpled, axes):
         one = [each[i] if axis == 0 else each for each, axis in zip(arguments, axes, strict=True)]
         for alone, found in zip(jax.jit(both)(*one, step), together, strict=True):
             np.testing.assert_allclose(alone, found[i], rtol=1e-5, atol=1e-5 * np.abs(alone).max())
+
+
+@needs_compilers
+@pytest.mark.parametrize("faces", [20, 700])
+def test_the_nearest_face_is_that_of_brute_force(faces):
+    """On faces, beside them and far away, of triangles of all shapes; two bodies at once."""
+    random = np.random.default_rng(0)
+    indices = np.arange(3 * faces, dtype=np.int32).reshape(faces, 3)
+
+    def search(positions, body, groups):
+        return kernels.nearest_face(positions, body, proximity.Patches(indices, indices, indices, groups, indices))
+
+    search = jax.jit(kernels.in_kernels(jax.vmap(search, (0, 0, None))))
+    for _ in range(100):
+        (first, groups), (second, _) = soup(random, faces), soup(random, faces)
+        corners, positions = np.stack([first, second]), random.normal(size=(2, 60, 3))
+        weights, on = random.dirichlet(np.ones(3), (2, 20)), random.choice(faces, 20)
+        positions[:, :20] = np.einsum("bvk,bvkc->bvc", weights, corners[:, on])
+        positions[:, 20] = [30.0, -20.0, 10.0]
+        positions = positions.astype(np.float32)
+        positions[:, 21:23] = np.array([np.nan, np.inf])[:, None]
+        found = np.asarray(search(positions, corners.reshape(2, -1, 3), groups))
+        assert (0 <= found).all() and (found < faces).all()
+        with jax.enable_x64(True):
+            given = (positions[:, :, None].astype(np.float64), corners[:, None].astype(np.float64))
+            apart = np.sqrt(proximity.closest_on_triangle(*given)[1])
+        chosen = np.take_along_axis(apart, found[..., None], axis=2)[..., 0]
+        finite = np.isfinite(positions).all(axis=2)
+        np.testing.assert_allclose(chosen[finite], apart.min(axis=2)[finite], rtol=1e-6, atol=2e-6)
+
+
+@needs_compilers
+def test_contact_is_that_of_jax():
+    """Of vertices and edges about two dented balls, some deep inside, some on the surface."""
+    vertices, faces = icosphere(3)
+    vertices = (vertices * (1.0 - 0.2 * np.abs(vertices[:, :1]) ** 3)).astype(np.float32)
+    patches, random = proximity.patches(vertices, faces), np.random.default_rng(0)
+    positions = random.normal(size=(2, 400, 3))
+    positions *= random.uniform(0.7, 1.2, (2, 400, 1)) / np.linalg.norm(positions, axis=-1, keepdims=True)
+    positions = positions.astype(np.float32)
+    positions[:, :40] = vertices[:40]
+    near = np.argsort(np.linalg.norm(positions[0, :, None] - positions[0], axis=-1), axis=1)[:, 1:4]
+    edges = np.stack([np.repeat(np.arange(400), 3), near.reshape(-1)], axis=1).astype(np.int32)
+    bodies = np.stack([vertices, np.float32(1.1) * vertices])
+    mesh = sheet()[1]._replace(edges=edges)
+
+    def contact(positions, body):
+        planes = contact_search.find(positions, body, body, patches)
+        at_edges = contact_search.find_at_edges(positions, planes, mesh, body, body, patches)
+        ends = positions[edges]
+        between = ends[:, 0] + at_edges.place[:, None] * (ends[:, 1] - ends[:, 0])
+        return (
+            contact_search.distance(positions, planes.point, planes.normal),
+            contact_search.distance(between, at_edges.point_next, at_edges.normal_next),
+        )
+
+    wrapped = jax.jit(kernels.in_kernels(jax.vmap(contact)))
+    assert str(jax.make_jaxpr(wrapped)(positions, bodies)).count("ffi_call") == 2
+    expected = jax.jit(jax.vmap(contact))(positions, bodies)
+    assert all((distances < -0.01).sum() > 50 for distances in expected)
+    for distances, others in zip(wrapped(positions, bodies), expected, strict=True):
+        np.testing.assert_allclose(distances, others, atol=1e-6)
 
 
 @needs_compilers
