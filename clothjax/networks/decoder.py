@@ -8,6 +8,7 @@ from clothjax.body import skinning
 from clothjax.config import ModelConfig
 from clothjax.networks import mlp
 from clothjax.networks.mlp import MLP, Params
+from clothjax.physics import kernels
 from clothjax.types import Array
 
 
@@ -37,11 +38,12 @@ class Decoder(nn.Module):
             latent: [L], the code.
             free: [V], 1 for a vertex that moves and 0 for a pinned one, whose displacement is zero (`phi.free`).
         """
-        shapes = self.blendshapes
-        flat = jnp.matmul(
-            self.blend_weights(latent), shapes.reshape(shapes.shape[0], -1), precision=jax.lax.Precision.HIGHEST
-        )
-        return flat.reshape(shapes.shape[1:]) * free[:, None]
+        weights, shapes = self.blend_weights(latent), self.blendshapes.reshape(len(self.blendshapes), -1)
+        if kernels.used(weights):
+            flat = kernels.blended(weights, shapes)
+        else:
+            flat = jnp.matmul(weights, shapes, precision=jax.lax.Precision.HIGHEST)
+        return flat.reshape(self.blendshapes.shape[1:]) * free[:, None]
 
     def blend_weights(self, latent: Array) -> Array:
         """Return the blend weights [K] of a code [L]."""

@@ -1,4 +1,4 @@
-// Energies and relaxation of cloth, a sparse solve and searches, as functions that XLA calls: see kernels.py.
+// Energies and relaxation of cloth, its blend shapes, a sparse solve and searches, as functions that XLA calls: see kernels.py.
 //
 // Positions are rows [3][V]. Loops over elements first write the gradients at all corners, [3][k elements + 1]; then
 // loops over vertices add up those of their own corners, which `place` [most][V] names. The last entry of a row is zero:
@@ -20,6 +20,9 @@ using Result = ffi::ResultBuffer<ffi::F32>;
 using Indices = ffi::ResultBuffer<ffi::S32>;
 
 constexpr size_t BLOCK = 256;      // elements whose energies are computed before they are added up
+constexpr size_t CHUNK = 1024;    // numbers of a blend shape that stay in the nearest cache
+constexpr size_t ROWS = 4;         // blend shapes that are read together
+constexpr size_t LANES = 16;       // numbers of a vector
 constexpr size_t WIDE = 24;        // right-hand sides that are solved for together
 constexpr float SLIVER = 1e-6f;    // twice the area, over a hinge's squared size, below which a face has no direction
 
@@ -411,6 +414,65 @@ static ffi::Error Solve(Floats right, Integers order, Integers start, Integers b
   return ffi::Error::Success();
 }
 
+// Sums of blend shapes [K][N] by weights [...][K]: the shapes are read once for all of a batch.
+static ffi::Error Blend(Floats weights, Floats shapes, Result sums) {
+  const size_t K = from_last(weights, 0), N = from_last(shapes, 0), count = weights.element_count() / K;
+  if (shapes.element_count() != K * N) return unfit();
+  const float *w = weights.typed_data(), *d = shapes.typed_data();
+  std::memset(sums->typed_data(), 0, sums->size_bytes());
+  for (size_t begin = 0; begin < N; begin += CHUNK) {
+    const size_t wide = N - begin < CHUNK ? N - begin : CHUNK;
+    for (size_t k = 0; k < K; k += ROWS)
+      for (size_t b = 0; b < count; b++) {
+        float *__restrict to = sums->typed_data() + N * b + begin;
+        const float *__restrict row = d + N * k + begin;
+        const float *by = w + K * b + k;
+        if (k + ROWS <= K)
+          for (size_t n = 0; n < wide; n++)
+            to[n] += by[0] * row[n] + by[1] * row[N + n] + by[2] * row[2 * N + n] + by[3] * row[3 * N + n];
+        else
+          for (size_t r = 0; r < K - k; r++)
+            for (size_t n = 0; n < wide; n++) to[n] += by[r] * row[N * r + n];
+      }
+  }
+  return ffi::Error::Success();
+}
+
+typedef float Vector __attribute__((vector_size(LANES * sizeof(float))));
+
+static inline Vector loaded(const float *from) {
+  Vector all;
+  std::memcpy(&all, from, sizeof all);
+  return all;
+}
+
+// Its transpose: products of the blend shapes with cotangents [...][N].
+static ffi::Error BlendBack(Floats cotangent, Floats shapes, Result products) {
+  const size_t N = from_last(shapes, 0), K = from_last(shapes, 1), count = cotangent.element_count() / N;
+  if (shapes.element_count() != K * N) return unfit();
+  const float *d = shapes.typed_data();
+  std::memset(products->typed_data(), 0, products->size_bytes());
+  for (size_t begin = 0; begin < N; begin += CHUNK) {
+    const size_t wide = N - begin < CHUNK ? N - begin : CHUNK, whole = wide / LANES * LANES;
+    for (size_t k = 0; k < K; k += ROWS)
+      for (size_t b = 0; b < count; b++) {
+        const float *__restrict from = cotangent.typed_data() + N * b + begin;
+        Vector sum[ROWS] = {};
+        const float *row[ROWS];
+        for (size_t r = 0; r < ROWS; r++) row[r] = d + N * (k + r < K ? k + r : K - 1) + begin;
+        for (size_t n = 0; n < whole; n += LANES)
+          for (size_t r = 0; r < ROWS; r++) sum[r] += loaded(row[r] + n) * loaded(from + n);
+        for (size_t r = 0; r < ROWS && k + r < K; r++) {
+          float total = 0.0f;
+          for (size_t n = whole; n < wide; n++) total += row[r][n] * from[n];
+          for (size_t i = 0; i < LANES; i++) total += sum[r][i];
+          products->typed_data()[K * b + k + r] += total;
+        }
+      }
+  }
+  return ffi::Error::Success();
+}
+
 static Point point(const float *rows, size_t index) {
   return {rows[3 * index], rows[3 * index + 1], rows[3 * index + 2]};
 }
@@ -463,3 +525,5 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFace, NearestFace, ffi::Ffi::Bind()
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFaceAround, NearestFaceAround, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Integers>()
     .Ret<ffi::Buffer<ffi::S32>>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothBlend, Blend, ffi::Ffi::Bind().Arg<Floats>().Arg<Floats>().Ret<Floats>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothBlendBack, BlendBack, ffi::Ffi::Bind().Arg<Floats>().Arg<Floats>().Ret<Floats>());

@@ -1,7 +1,7 @@
-"""Energies, relaxation, a sparse solve and searches in C++, for descents on a CPU, where XLA's loops take longer.
+"""Energies, relaxation, blend shapes, a sparse solve and searches in C++: faster than XLA in descents on a CPU.
 
 The form in jax is the reference. All use it but functions that `in_kernels` wraps, where there is a compiler. Kernels
-are in single precision, and have derivatives by positions alone, in reverse mode alone.
+are in single precision. They have derivatives by positions and blend weights alone, in reverse mode alone.
 """
 
 import contextvars
@@ -24,7 +24,10 @@ from clothjax.types import Array, EdgeContact, Material, Mesh, Rest
 
 SOURCE = Path(__file__).with_suffix(".cc")
 ENERGIES = ("ClothStretching", "ClothBending", "ClothEdgeCollision")
-SYMBOLS = (*ENERGIES, "ClothRelax", "ClothRelaxBack", "ClothSolve", "ClothNearestFace", "ClothNearestFaceAround")
+SYMBOLS = (
+    *ENERGIES, "ClothRelax", "ClothRelaxBack", "ClothBlend", "ClothBlendBack", "ClothSolve", "ClothNearestFace",
+    "ClothNearestFaceAround",
+)  # fmt: skip
 
 _used: contextvars.ContextVar[bool] = contextvars.ContextVar("kernels", default=False)
 
@@ -159,7 +162,7 @@ _energy.defvjp(_energy_forward, _energy_backward, symbolic_zeros=True)
 def _constant(operands: tuple) -> tuple:
     """Return the values of operands that `symbolic_zeros` tells whether one differentiates by."""
     if any(operand.perturbed for operand in operands):
-        raise NotImplementedError("kernels have derivatives by positions alone")
+        raise NotImplementedError("kernels have derivatives by positions and weights alone")
     return tuple(operand.value for operand in operands)
 
 
@@ -206,6 +209,24 @@ def _relaxed_backward(steps: int, longest: float, passed: tuple, cotangent: Arra
 
 
 _relaxed.defvjp(_relaxed_forward, _relaxed_backward, symbolic_zeros=True)
+
+
+@jax.custom_vjp
+def blended(weights: Float[Array, " K"], shapes: Float[Array, "K N"]) -> Float[Array, " N"]:
+    """Return blend shapes [K, N] in a sum by weights [K]."""
+    return _call("ClothBlend", [shapes.shape[1:]], weights, shapes)[0]
+
+
+def _blended_forward(weights, shapes) -> tuple[Array, Array]:
+    (shapes,) = _constant((shapes,))
+    return blended(weights.value, shapes), shapes
+
+
+def _blended_backward(shapes: Array, cotangent: Array) -> tuple[Array, None]:
+    return _call("ClothBlendBack", [shapes.shape[:1]], cotangent, shapes)[0], None
+
+
+blended.defvjp(_blended_forward, _blended_backward, symbolic_zeros=True)
 
 
 class Factor(NamedTuple):

@@ -118,6 +118,25 @@ def test_garments_of_a_batch_are_as_each_alone(crumpled, axes):
 
 
 @needs_compilers
+@pytest.mark.parametrize("count, numbers", [(1, 5), (7, 1024), (24, 3047)])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_sums_of_blend_shapes_and_their_derivative_are_those_of_jax(count, numbers, batch):
+    random = np.random.default_rng(0)
+    shapes = random.normal(size=(count, numbers)).astype(np.float32)
+    weights, cotangent = random.normal(size=(*batch, count)), random.normal(size=(*batch, numbers))
+
+    def both(weights, cotangent):
+        found, pull = jax.vjp(lambda weights: kernels.blended(weights, shapes), weights)
+        return found, pull(cotangent)[0]
+
+    for _ in batch:
+        both = jax.vmap(both)
+    sums, products = jax.jit(kernels.in_kernels(both))(*single((weights, cotangent)))
+    np.testing.assert_allclose(sums, weights @ shapes, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(products, cotangent @ shapes.T.astype(np.float64), rtol=0, atol=2e-6 * numbers**0.5 * 10)
+
+
+@needs_compilers
 @pytest.mark.parametrize("faces", [20, 700])
 def test_the_nearest_face_is_that_of_brute_force(faces):
     """On faces, beside them and far away, of triangles of all shapes; two bodies at once."""
@@ -192,7 +211,7 @@ def test_what_kernels_do_not_have_is_refused(crumpled):
         return potential(mesh)(x, step._replace(material=step.material._replace(mu=mu)))
 
     assert jax.grad(by_stiffness)(jnp.float32(1e4)) > 0
-    with pytest.raises(NotImplementedError, match="derivatives by positions alone"):
+    with pytest.raises(NotImplementedError, match="derivatives by positions and weights alone"):
         jax.grad(kernels.in_kernels(by_stiffness))(jnp.float32(1e4))
 
 
