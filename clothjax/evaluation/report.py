@@ -94,11 +94,9 @@ def evaluate(
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
     for name in names:
         assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
-    parts = [(measure_motion, name) for name in names] + [(measure_long, names[0])]
-    if config.evaluation.wearers:
-        parts.append((measure_wearers, names[0]))
-    if config.stage2.forces:
-        parts.append((measure_pushed, names[0]))
+    parts: list[Part] = [(measure_wearers, names[0])] if config.evaluation.wearers else []  # what takes longest first
+    parts += [(measure_pushed, names[0])] if config.stage2.forces else []
+    parts += [(measure_motion, name) for name in names] + [(measure_long, names[0])]
     with progress_bar("evaluating", len(parts)) as report:
         found = dict(zip(parts, _all(measured, parts, settings, jobs, report), strict=True))
     by_motion = {Path(name).stem: found[measure_motion, name] for name in names}
