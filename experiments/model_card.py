@@ -135,6 +135,8 @@ def _worst(report: dict) -> list[str]:
             rows.append(f"| {kind} | {shown} | {gaps[name]:.2f} | {sum(gaps.values()) / len(gaps):.2f} |")
     clip = next(iter(report["motions"])).removesuffix(".motion")
     about = f"Characters and pushes are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
+    if not report.get("wearers") and not report.get("pushed"):
+        about = "Other characters, and pushes, were not measured."
     return ["## Where it is worst", about, "\n".join(rows)]
 
 
