@@ -134,8 +134,9 @@ def _worst(report: dict) -> list[str]:
             shown = {"none": "no push"}.get(name, name.removesuffix(".motion"))
             rows.append(f"| {kind} | {shown} | {gaps[name]:.2f} | {sum(gaps.values()) / len(gaps):.2f} |")
     clip = next(iter(report["motions"])).removesuffix(".motion")
-    about = f"Characters and pushes are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
-    if not report.get("wearers") and not report.get("pushed"):
+    kinds = [name for name, group in (("characters", "wearers"), ("pushes", "pushed")) if report.get(group)]
+    about = f"{' and '.join(kinds).capitalize()} are of the first {CHARACTERS_FRAMES} frames of `{clip}`."
+    if not kinds:
         about = "Other characters, and pushes, were not measured."
     return ["## Where it is worst", about, "\n".join(rows)]
 

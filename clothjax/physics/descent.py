@@ -99,7 +99,9 @@ def _step(last: _Iterate, objective: Objective, precondition: Precondition, boun
         gradient=jnp.where(falls, gradient, last.gradient),
         moves=moves,
         turns=remembered(last.turns, turn),
-        products=remembered(last.products.T, jnp.where(jnp.arange(MEMORY) == row, curvature, _times(moves, turn))).T,
+        products=remembered(
+            last.products.T, jnp.where(jnp.arange(MEMORY, dtype=jnp.int32) == row, curvature, _times(moves, turn))
+        ).T,
         newest=row,
     )
     # the minimum of the parabola through both energies and the slope

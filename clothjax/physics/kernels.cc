@@ -285,6 +285,9 @@ static size_t from_last(const Buffer &of, size_t back) {
   return of.dimensions()[of.dimensions().size() - 1 - back];
 }
 
+// Whether all of a batch share a table.
+static bool shared(const Integers &table) { return table.element_count() == from_last(table, 0) * from_last(table, 1); }
+
 static Elements elements(const Integers &corner, const Integers &place) {
   return {from_last(corner, 0), from_last(place, 0), from_last(place, 1), corner.typed_data(), place.typed_data()};
 }
@@ -480,7 +483,7 @@ static Point point(const float *rows, size_t index) {
 // The faces nearest to positions [V][3], of a body [B][3].
 static ffi::Error NearestFace(Floats x, Floats body, Integers faces, Integers groups, Indices nearest) {
   const size_t V = from_last(x, 1), B = from_last(body, 1), count = nearest->element_count() / V;
-  if (!fit(count, {{&x, 3 * V}, {&body, 3 * B}})) return unfit();
+  if (!fit(count, {{&x, 3 * V}, {&body, 3 * B}}) || !shared(faces) || !shared(groups)) return unfit();
   for (size_t b = 0; b < count; b++) {
     Boxes boxes(row(body, 3 * B, b), faces.typed_data(), groups.typed_data(), from_last(groups, 1),
                 from_last(groups, 0));
@@ -494,6 +497,7 @@ static ffi::Error NearestFaceAround(Floats x, Floats body, Integers faces, Integ
                                     Integers second, Indices nearest) {
   const size_t V = from_last(x, 1), B = from_last(body, 1), count = nearest->element_count() / V;
   if (!fit(count, {{&x, 3 * V}, {&body, 3 * B}}) || !fit<Integers>(count, {{&first, V}, {&second, V}})) return unfit();
+  if (!shared(faces) || !shared(around) || from_last(around, 1) != B) return unfit();
   for (size_t b = 0; b < count; b++) {
     const Fans fans(row(body, 3 * B, b), faces.typed_data(), around.typed_data(), B, from_last(around, 0));
     const int32_t *one = row(first, V, b), *other = row(second, V, b);

@@ -51,11 +51,13 @@ def in_kernels(function: Callable) -> Callable:
     return wrapped
 
 
-@functools.cache
 def built() -> bool:
     """Return whether kernels are there: build them on a CPU, and tell it if that fails."""
-    if jax.default_backend() != "cpu":
-        return False
+    return jax.default_backend() == "cpu" and _compiled()
+
+
+@functools.cache
+def _compiled() -> bool:
     try:
         compilers.register(SOURCE, SYMBOLS)
     except OSError as error:

@@ -111,6 +111,7 @@ class Boxes {
 
   // Groups in the order of the distance to their boxes, until the next box is farther than the nearest triangle so far.
   int32_t nearest(Point p) {
+    if (!std::isfinite(p.x + p.y + p.z)) return 0;
     const float place[3] = {p.x, p.y, p.z};
     float *__restrict away = away_.data();
     for (size_t g = 0; g < count_; g++) away[g] = 0.0f;

@@ -236,12 +236,12 @@ def test_without_a_compiler_that_works_jax_computes_all(crumpled, monkeypatch, c
     x, mesh, step = single(crumpled)
     monkeypatch.setattr(compilers, "compiler", programs.get)
     monkeypatch.setattr(compilers, "_registered", set())
-    kernels.built.cache_clear()
+    kernels._compiled.cache_clear()
     try:
         for _ in range(2):
             assert "ffi_call" not in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
     finally:
-        kernels.built.cache_clear()
+        kernels._compiled.cache_clear()
     out = capsys.readouterr().out
     assert out.count("descents are left to jax, which takes longer: ") == 1 and told in out and out.count("\n") == 1
 

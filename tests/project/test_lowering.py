@@ -39,7 +39,9 @@ def lower(program, *arguments, **options):
         return program(*arguments, **options)
 
     # `JIT` is jax.jit itself: a test may put another one in its place
-    JIT(of_arrays).trace(arrays).lower(lowering_platforms=PLATFORMS)
+    traced = JIT(of_arrays).trace(arrays)
+    assert "Cloth" not in str(traced.jaxpr)  # a kernel of a CPU
+    traced.lower(lowering_platforms=PLATFORMS)
 
 
 class Lowered:
