@@ -30,7 +30,7 @@ class _Iterate(NamedTuple):
     share: Array  # ... how far to go along it
     moves: Array  # [M, L] changes of the code, ...
     turns: Array  # [M, L] ... of the gradient, and ...
-    products: Array  # [M, M] ... the product of a move with a turn as old or newer; zero where there was no step
+    products: Array  # [M, M] ... the product of each move with each turn as old or newer; stale with older ones
     newest: Array  # row of the last step; those before it go before it, in a ring
 
 

@@ -1,8 +1,10 @@
-// Energies and relaxation of cloth, its blend shapes, a sparse solve and searches, as functions that XLA calls: see kernels.py.
+// Energies and relaxation of cloth, sums of blend shapes, a sparse solve and searches, as functions that XLA calls: see
+// kernels.py.
 //
-// Positions are rows [3][V]. Loops over elements first write the gradients at all corners, [3][k elements + 1]; then
-// loops over vertices add up those of their own corners, which `place` [most][V] names. The last entry of a row is zero:
-// it is named by vertices with fewer corners than others. So none of these loops scatters, and they become vectors.
+// Energies and relaxation have positions as rows [3][V]. Loops over elements first write the gradients at all corners,
+// [3][k elements + 1]; then loops over vertices add up those of their own corners, which `place` [most][V] names. The
+// last entry of a row is zero: it is named by vertices with fewer corners than others. So none of these loops scatters,
+// and they become vectors.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -20,10 +22,9 @@ using Result = ffi::ResultBuffer<ffi::F32>;
 using Indices = ffi::ResultBuffer<ffi::S32>;
 
 constexpr size_t BLOCK = 256;      // elements whose energies are computed before they are added up
-constexpr size_t CHUNK = 1024;    // numbers of a blend shape that stay in the nearest cache
-constexpr size_t ROWS = 4;         // blend shapes that are read together
-constexpr size_t LANES = 16;       // numbers of a vector
-constexpr size_t WIDE = 24;        // right-hand sides that are solved for together
+constexpr size_t CHUNK = 1024;     // numbers of a blend shape that stay in the nearest cache
+constexpr size_t TOGETHER = 4;     // blend shapes that are read together
+constexpr size_t COLUMNS = 24;     // right-hand sides that are solved for together
 constexpr float SLIVER = 1e-6f;    // twice the area, over a hinge's squared size, below which a face has no direction
 
 struct Elements {
@@ -204,7 +205,8 @@ static double bending(const Hinges &h, const float *__restrict x, float *__restr
   return energy;
 }
 
-// The energy of edges in the body (incremental_potential.edge_collision), of planes [3][count] at places between the ends.
+// The energy of edges in the body (incremental_potential.edge_collision), of planes [3][count] at places between the
+// ends.
 static double edge_collision(const Elements &edges, const float *__restrict place, const float *__restrict point,
                              const float *__restrict normal, float stiffness, float offset, const float *__restrict x,
                              float *__restrict corners, float *gradient) {
@@ -235,7 +237,8 @@ static double edge_collision(const Elements &edges, const float *__restrict plac
   return energy;
 }
 
-// A Jacobi step (relaxation.relaxed): the move m = -mobility gradient, of which m / sqrt(1 + |m|^2 / longest^2) is taken.
+// A Jacobi step (relaxation.relaxed): the move m = -mobility gradient, of which m / sqrt(1 + |m|^2 / longest^2) is
+// taken.
 static void relax(const Sheet &s, const float *mobility, float longest, const float *__restrict x, float *corners,
                   float *__restrict g, float *__restrict next) {
   const size_t V = s.faces.vertices;
@@ -278,7 +281,9 @@ static bool fit(size_t count, std::initializer_list<std::pair<const Buffer *, si
   return true;
 }
 
-static ffi::Error unfit() { return ffi::Error::InvalidArgument("kernels of cloth take batches of one jax.vmap"); }
+static ffi::Error unfit() {
+  return ffi::Error::InvalidArgument("operands do not fit: kernels of cloth take batches of one jax.vmap");
+}
 
 template <typename Buffer>
 static size_t from_last(const Buffer &of, size_t back) {
@@ -376,8 +381,8 @@ static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats after, Floats mob
   return ffi::Error::Success();
 }
 
-// Solves L D L^T x = b for many b [...][V][3]: the columns of L below its diagonal of ones, in the order in which vertices
-// are eliminated, and 1 / D. Vertices that are not in the order get zeros.
+// Solves L D L^T x = b for many b [...][V][3]. Given are the columns of L below its diagonal of ones, in the order in
+// which vertices are eliminated, and 1 / D. Vertices that are not in the order get zeros.
 static ffi::Error Solve(Floats right, Integers order, Integers start, Integers below, Floats lower, Floats pivot,
                         Result solution) {
   const size_t V = from_last(right, 1), n = order.element_count(), columns = right.element_count() / V;
@@ -386,35 +391,48 @@ static ffi::Error Solve(Floats right, Integers order, Integers start, Integers b
   const int32_t *vertex = order.typed_data(), *begin = start.typed_data(), *row_of = below.typed_data();
   const float *__restrict factor = lower.typed_data(), *inverse = pivot.typed_data();
   std::memset(solution->typed_data(), 0, solution->size_bytes());
-  std::vector<float> room(n * WIDE);
+  std::vector<float> room(n * COLUMNS);
   float *__restrict x = room.data();
-  for (size_t first = 0; first < columns; first += WIDE) {
-    const size_t count = columns - first < WIDE ? columns - first : WIDE;
-    size_t place[WIDE];
+  for (size_t first = 0; first < columns; first += COLUMNS) {
+    const size_t count = columns - first < COLUMNS ? columns - first : COLUMNS;
+    size_t place[COLUMNS];
     for (size_t c = 0; c < count; c++) place[c] = (first + c) / 3 * 3 * V + (first + c) % 3;
     for (size_t j = 0; j < n; j++)
-      for (size_t c = 0; c < count; c++) x[WIDE * j + c] = right.typed_data()[place[c] + 3 * (size_t)vertex[j]];
+      for (size_t c = 0; c < count; c++) x[COLUMNS * j + c] = right.typed_data()[place[c] + 3 * (size_t)vertex[j]];
     for (size_t j = 0; j < n; j++) {
-      float known[WIDE];
-      std::memcpy(known, x + WIDE * j, sizeof known);
+      float known[COLUMNS];
+      std::memcpy(known, x + COLUMNS * j, sizeof known);
       for (int32_t p = begin[j]; p < begin[j + 1]; p++) {
-        float *to = x + WIDE * (size_t)row_of[p];
-        for (size_t c = 0; c < WIDE; c++) to[c] -= factor[p] * known[c];
+        float *to = x + COLUMNS * (size_t)row_of[p];
+        for (size_t c = 0; c < COLUMNS; c++) to[c] -= factor[p] * known[c];
       }
     }
     for (size_t j = n; j-- > 0;) {
-      float sum[WIDE];
-      for (size_t c = 0; c < WIDE; c++) sum[c] = inverse[j] * x[WIDE * j + c];
+      float sum[COLUMNS];
+      for (size_t c = 0; c < COLUMNS; c++) sum[c] = inverse[j] * x[COLUMNS * j + c];
       for (int32_t p = begin[j]; p < begin[j + 1]; p++) {
-        const float *from = x + WIDE * (size_t)row_of[p];
-        for (size_t c = 0; c < WIDE; c++) sum[c] -= factor[p] * from[c];
+        const float *from = x + COLUMNS * (size_t)row_of[p];
+        for (size_t c = 0; c < COLUMNS; c++) sum[c] -= factor[p] * from[c];
       }
-      std::memcpy(x + WIDE * j, sum, sizeof sum);
+      std::memcpy(x + COLUMNS * j, sum, sizeof sum);
     }
     for (size_t j = 0; j < n; j++)
-      for (size_t c = 0; c < count; c++) solution->typed_data()[place[c] + 3 * (size_t)vertex[j]] = x[WIDE * j + c];
+      for (size_t c = 0; c < count; c++) solution->typed_data()[place[c] + 3 * (size_t)vertex[j]] = x[COLUMNS * j + c];
   }
   return ffi::Error::Success();
+}
+
+// The blend shapes of [K][N] from one on; past the last, the last again.
+struct Several {
+  const float *shape[TOGETHER];
+  size_t count;
+};
+
+static inline Several several(const float *shapes, size_t N, size_t K, size_t k) {
+  Several s;
+  s.count = K - k < TOGETHER ? K - k : TOGETHER;
+  for (size_t r = 0; r < TOGETHER; r++) s.shape[r] = shapes + N * (r < s.count ? k + r : K - 1);
+  return s;
 }
 
 // Sums of blend shapes [K][N] by weights [...][K]: the shapes are read once for all of a batch.
@@ -425,23 +443,23 @@ static ffi::Error Blend(Floats weights, Floats shapes, Result sums) {
   std::memset(sums->typed_data(), 0, sums->size_bytes());
   for (size_t begin = 0; begin < N; begin += CHUNK) {
     const size_t wide = N - begin < CHUNK ? N - begin : CHUNK;
-    for (size_t k = 0; k < K; k += ROWS)
+    for (size_t k = 0; k < K; k += TOGETHER)
       for (size_t b = 0; b < count; b++) {
         float *__restrict to = sums->typed_data() + N * b + begin;
-        const float *__restrict row = d + N * k + begin;
-        const float *by = w + K * b + k;
-        if (k + ROWS <= K)
-          for (size_t n = 0; n < wide; n++)
-            to[n] += by[0] * row[n] + by[1] * row[N + n] + by[2] * row[2 * N + n] + by[3] * row[3 * N + n];
-        else
-          for (size_t r = 0; r < K - k; r++)
-            for (size_t n = 0; n < wide; n++) to[n] += by[r] * row[N * r + n];
+        const Several s = several(d + begin, N, K, k);
+        float by[TOGETHER];
+        for (size_t r = 0; r < TOGETHER; r++) by[r] = r < s.count ? w[K * b + k + r] : 0.0f;
+        for (size_t n = 0; n < wide; n++) {
+          float sum = to[n];
+          for (size_t r = 0; r < TOGETHER; r++) sum += by[r] * s.shape[r][n];
+          to[n] = sum;
+        }
       }
   }
   return ffi::Error::Success();
 }
 
-typedef float Vector __attribute__((vector_size(LANES * sizeof(float))));
+typedef float Vector __attribute__((vector_size(WIDTH * sizeof(float))));
 
 static inline Vector loaded(const float *from) {
   Vector all;
@@ -456,19 +474,18 @@ static ffi::Error BlendBack(Floats cotangent, Floats shapes, Result products) {
   const float *d = shapes.typed_data();
   std::memset(products->typed_data(), 0, products->size_bytes());
   for (size_t begin = 0; begin < N; begin += CHUNK) {
-    const size_t wide = N - begin < CHUNK ? N - begin : CHUNK, whole = wide / LANES * LANES;
-    for (size_t k = 0; k < K; k += ROWS)
+    const size_t wide = N - begin < CHUNK ? N - begin : CHUNK, whole = wide / WIDTH * WIDTH;
+    for (size_t k = 0; k < K; k += TOGETHER)
       for (size_t b = 0; b < count; b++) {
         const float *__restrict from = cotangent.typed_data() + N * b + begin;
-        Vector sum[ROWS] = {};
-        const float *row[ROWS];
-        for (size_t r = 0; r < ROWS; r++) row[r] = d + N * (k + r < K ? k + r : K - 1) + begin;
-        for (size_t n = 0; n < whole; n += LANES)
-          for (size_t r = 0; r < ROWS; r++) sum[r] += loaded(row[r] + n) * loaded(from + n);
-        for (size_t r = 0; r < ROWS && k + r < K; r++) {
+        const Several s = several(d + begin, N, K, k);
+        Vector sum[TOGETHER] = {};
+        for (size_t n = 0; n < whole; n += WIDTH)
+          for (size_t r = 0; r < TOGETHER; r++) sum[r] += loaded(s.shape[r] + n) * loaded(from + n);
+        for (size_t r = 0; r < s.count; r++) {
           float total = 0.0f;
-          for (size_t n = whole; n < wide; n++) total += row[r][n] * from[n];
-          for (size_t i = 0; i < LANES; i++) total += sum[r][i];
+          for (size_t n = whole; n < wide; n++) total += s.shape[r][n] * from[n];
+          for (size_t i = 0; i < WIDTH; i++) total += sum[r][i];
           products->typed_data()[K * b + k + r] += total;
         }
       }
@@ -492,9 +509,9 @@ static ffi::Error NearestFace(Floats x, Floats body, Integers faces, Integers gr
   return ffi::Error::Success();
 }
 
-// Likewise, searched for from two vertices [V] of the body each.
+// Likewise, searched for from two vertices [V] of the body each, in some strides.
 static ffi::Error NearestFaceAround(Floats x, Floats body, Integers faces, Integers around, Integers first,
-                                    Integers second, Indices nearest) {
+                                    Integers second, int32_t strides, Indices nearest) {
   const size_t V = from_last(x, 1), B = from_last(body, 1), count = nearest->element_count() / V;
   if (!fit(count, {{&x, 3 * V}, {&body, 3 * B}}) || !fit<Integers>(count, {{&first, V}, {&second, V}})) return unfit();
   if (!shared(faces) || !shared(around) || from_last(around, 1) != B) return unfit();
@@ -502,7 +519,7 @@ static ffi::Error NearestFaceAround(Floats x, Floats body, Integers faces, Integ
     const Fans fans(row(body, 3 * B, b), faces.typed_data(), around.typed_data(), B, from_last(around, 0));
     const int32_t *one = row(first, V, b), *other = row(second, V, b);
     for (size_t v = 0; v < V; v++)
-      nearest->typed_data()[V * b + v] = fans.nearest(point(row(x, 3 * V, b), v), one[v], other[v]);
+      nearest->typed_data()[V * b + v] = fans.nearest(point(row(x, 3 * V, b), v), one[v], other[v], strides);
   }
   return ffi::Error::Success();
 }
@@ -525,9 +542,9 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelaxBack, RelaxBack, ffi::Ffi::Bind()
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothSolve, Solve, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFace, NearestFace, ffi::Ffi::Bind()
-    .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Ret<ffi::Buffer<ffi::S32>>());
+    .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Ret<Integers>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFaceAround, NearestFaceAround, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Integers>()
-    .Ret<ffi::Buffer<ffi::S32>>());
+    .Attr<int32_t>("strides").Ret<Integers>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothBlend, Blend, ffi::Ffi::Bind().Arg<Floats>().Arg<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothBlendBack, BlendBack, ffi::Ffi::Bind().Arg<Floats>().Arg<Floats>().Ret<Floats>());

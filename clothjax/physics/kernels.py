@@ -17,16 +17,15 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from clothjax import progress
-from clothjax.geometry.proximity import Patches
+from clothjax.geometry.proximity import STRIDES, Patches
 from clothjax.physics import compilers
 from clothjax.physics.energies import THICKNESS
 from clothjax.types import Array, EdgeContact, Material, Mesh, Rest
 
 SOURCE = Path(__file__).with_suffix(".cc")
-ENERGIES = ("ClothStretching", "ClothBending", "ClothEdgeCollision")
 SYMBOLS = (
-    *ENERGIES, "ClothRelax", "ClothRelaxBack", "ClothBlend", "ClothBlendBack", "ClothSolve", "ClothNearestFace",
-    "ClothNearestFaceAround",
+    "ClothStretching", "ClothBending", "ClothEdgeCollision", "ClothRelax", "ClothRelaxBack", "ClothBlend",
+    "ClothBlendBack", "ClothSolve", "ClothNearestFace", "ClothNearestFaceAround",
 )  # fmt: skip
 
 _used: contextvars.ContextVar[bool] = contextvars.ContextVar("kernels", default=False)
@@ -66,10 +65,10 @@ def _compiled() -> bool:
     return True
 
 
-def used(position: Array, mesh: Iterable[Array] = ()) -> bool:
-    """Return whether kernels compute what is traced now, of positions [V, 3] in single precision on a known mesh."""
+def used(read: Array, mesh: Iterable[Array] = ()) -> bool:
+    """Return whether kernels compute what is traced now: what is read has single precision, and the mesh is known."""
     known = not any(isinstance(corners, Tracer) for corners in mesh)
-    return _used.get() and known and position.dtype == jnp.float32
+    return _used.get() and known and read.dtype == jnp.float32
 
 
 class Elements(NamedTuple):
@@ -256,10 +255,11 @@ def nearest_face_around(
 ) -> Int[Array, " V"]:
     """Return what `proximity.nearest_face_around` does, from two vertices each."""
     first, second = vertices
-    return _searched("ClothNearestFaceAround", positions, body, patches.faces, patches.around, first, second)
+    operands = (patches.faces, patches.around, first, second)
+    return _searched("ClothNearestFaceAround", positions, body, *operands, strides=np.int32(STRIDES))
 
 
-def _searched(name: str, positions: Array, body: Array, *operands: Array) -> Array:
+def _searched(name: str, positions: Array, body: Array, *operands: Array, **attributes: np.generic) -> Array:
     positions, body = jax.lax.stop_gradient((positions, body))
     kind = jax.ShapeDtypeStruct(positions.shape[:1], jnp.int32)
-    return jax.ffi.ffi_call(name, kind, vmap_method="expand_dims")(positions, body, *operands)
+    return jax.ffi.ffi_call(name, kind, vmap_method="expand_dims")(positions, body, *operands, **attributes)

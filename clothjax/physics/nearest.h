@@ -9,7 +9,6 @@
 #include <vector>
 
 constexpr size_t WIDTH = 16;  // triangles of a row
-constexpr int STRIDES = 2;    // steps of a search along a surface, as in proximity.py
 
 struct Row {
   float at[9][WIDTH];  // the first corner, and the other two from there
@@ -155,13 +154,13 @@ class Fans {
         fill(table_[v * rows_ + i / WIDTH], i % WIDTH, body, faces, around[v * most + (i < most ? i : most - 1)]);
   }
 
-  // Those around the first vertices, then those around the nearest corner of the best face, STRIDES times.
-  int32_t nearest(Point p, int32_t first, int32_t second) const {
+  // Those around the first vertices, then those around the nearest corner of the best face, in each of some strides.
+  int32_t nearest(Point p, int32_t first, int32_t second, int32_t strides) const {
     Nearest best;
     int32_t last = first;
     among(best, first, p);
     if (second != first) among(best, second, p), last = second;
-    for (int stride = 0; stride < STRIDES; stride++) {
+    for (int32_t stride = 0; stride < strides; stride++) {
       const Point a = corner(body_, faces_, best.face, 0), b = corner(body_, faces_, best.face, 1);
       const Point c = corner(body_, faces_, best.face, 2);
       float v, w;

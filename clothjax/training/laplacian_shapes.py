@@ -38,6 +38,7 @@ class Springs(NamedTuple):
         """Factorise `matrix`."""
         symmetric = {"SymmetricMode": True}
         both = scipy.sparse.linalg.splu(self.matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+        assert (both.perm_r == both.perm_c).all()  # no rows are exchanged, as the matrix is positive definite
         lower = scipy.sparse.tril(both.L, -1).tocsc()
         return kernels.Factor(
             self.free[np.argsort(both.perm_c)].astype(np.int32),

@@ -97,6 +97,43 @@ def test_the_direction_is_that_of_dense_bfgs(known, newest):
     np.testing.assert_allclose(found, -dense @ gradient, rtol=1e-9)
 
 
+def test_steps_beyond_the_memory_go_as_those_of_two_loops():
+    """Against algorithm 7.4 of Nocedal & Wright on the last steps, where some tries are not taken."""
+    random, size, kept = np.random.default_rng(0), 60, []
+    mixed = random.normal(size=(size, size))
+    inverse = np.diag(random.uniform(0.5, 2.0, size)) / size
+
+    def objective(x):
+        return 0.5 * jnp.sum((mixed @ x) ** 2) + jnp.sum(x**4), mixed.T @ (mixed @ x) + 4.0 * x**3
+
+    def direction(gradient):
+        rest, along = gradient, []
+        for move, turn in reversed(kept):
+            along.append((move @ rest) / (move @ turn))
+            rest = rest - along[-1] * turn
+        move, turn = kept[-1]
+        rest = np.clip((move @ turn) / (turn @ inverse @ turn), *descent.SCALE) * (inverse @ rest)
+        for (move, turn), share in zip(kept, reversed(along), strict=True):
+            rest = rest + (share - (turn @ rest) / (move @ turn)) * move
+        return -rest / np.sqrt(1.0 + rest @ rest / 9.0)
+
+    refused = 0
+    with jax.enable_x64(True):
+        settings = (objective, lambda g: jnp.asarray(inverse) @ g, 3.0)
+        step = jax.jit(lambda at: descent._step(at, *settings))
+        at = descent._first(jnp.asarray(3.0 * random.normal(size=size)), *settings)
+        for _ in range(2 * descent.MEMORY + 9):
+            last, at = at, step(at)
+            if at.energy == last.energy:
+                refused += 1
+                continue
+            kept = [*kept, (np.asarray(at.latent - last.latent), np.asarray(at.gradient - last.gradient))]
+            kept = kept[-descent.MEMORY :]
+            expected = direction(np.asarray(at.gradient))
+            np.testing.assert_allclose(at.direction, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    assert refused > 0 and len(kept) == descent.MEMORY
+
+
 def test_no_step_overshoots_what_the_hessian_does_not_know(coded):
     """A floor a thousand times stiffer than the cloth: every step goes down, and many end at the minimum."""
     inverse, decode, potential = coded

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from samples import icosphere, sheet, soup, time_step
 
-from clothjax.config import PhysicsConfig
+from clothjax.config import ModelConfig, PhysicsConfig
 from clothjax.geometry import proximity
+from clothjax.networks import decoder, mlp
 from clothjax.physics import compilers, contact_search, energies, incremental_potential, kernels, relaxation
 
 needs_compilers = pytest.mark.skipif(
@@ -199,8 +200,58 @@ def test_contact_is_that_of_jax():
 
 
 @needs_compilers
+@pytest.mark.parametrize("together", [(0, 0), (0, None), (None, 0)])
+def test_a_walk_is_that_of_jax(together):
+    """About vertices with more faces than a row has, of positions and bodies of their own or shared, from afar."""
+    around = np.arange(40) * np.pi / 20
+    rings = [[r * np.cos(around), np.full(40, y), r * np.sin(around)] for r, y in ((0.3, 0.2), (0.6, 0.0))]
+    vertices = np.concatenate([[[0.0, 0.3, 0.0]], *(np.transpose(ring) for ring in rings)]).astype(np.float32)
+    one, next_one = np.arange(40), (np.arange(40) + 1) % 40
+    faces = np.concatenate([
+        np.stack([np.zeros(40, int), next_one + 1, one + 1], 1),
+        np.stack([one + 1, next_one + 1, one + 41], 1),
+        np.stack([next_one + 1, next_one + 41, one + 41], 1),
+    ])  # fmt: skip
+    patches = jax.tree.map(jnp.asarray, proximity.patches(vertices, faces))
+    assert patches.around.shape[1] == 40
+    random = np.random.default_rng(0)
+    positions = random.uniform(-0.6, 0.6, (2, 300, 3)).astype(np.float32) * np.float32([1, 0.3, 1])
+    bodies = np.stack([vertices, vertices * np.float32([1, 2, 1])])
+    starts = random.integers(0, len(vertices), (2, 300)).astype(np.int32)
+    given = [each if axis == 0 else each[0] for each, axis in zip((positions, bodies), together, strict=True)]
+
+    def search(form):
+        def apart(x, body):
+            face = form(x, body, patches, list(starts))
+            return jnp.sqrt(proximity.closest_on_triangle(x, body[patches.faces][face])[1])
+
+        return jax.jit(kernels.in_kernels(jax.vmap(apart, together)))(*given)
+
+    found, expected = search(kernels.nearest_face_around), search(proximity.nearest_face_around)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@needs_compilers
+def test_a_decoder_is_that_of_jax():
+    config = ModelConfig(latent=6, blendshapes=9)
+    random = np.random.default_rng(0)
+    basis = random.normal(size=(9, 50, 3)).astype(np.float32)
+    garment = decoder.init(jax.random.key(0), 6, basis, config)
+    code, cotangent = random.normal(size=(3, 6)).astype(np.float32), random.normal(size=(50, 3)).astype(np.float32)
+
+    def both(code):
+        displaced, pull = jax.vjp(lambda z: mlp.apply(decoder.of(garment, config), garment, z, jnp.ones(50)), code)
+        return displaced, pull(cotangent)[0]
+
+    wrapped = jax.jit(kernels.in_kernels(jax.vmap(both)))
+    assert str(jax.make_jaxpr(wrapped)(code)).count("ffi_call") == 2
+    for found, expected in zip(wrapped(code), jax.jit(jax.vmap(both))(code), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@needs_compilers
 def test_what_kernels_do_not_have_is_refused(crumpled):
-    """Batches of batches, and derivatives by anything but positions."""
+    """Batches of batches or of tables, and derivatives by anything but positions and weights."""
     x, mesh, step = single(crumpled)
     step = jax.tree.map(jnp.asarray, step)
     both = jax.vmap(jax.vmap(of_relaxed(mesh), (0, None, None)), (None, 0, None))
@@ -209,6 +260,14 @@ def test_what_kernels_do_not_have_is_refused(crumpled):
 
     def by_stiffness(mu):
         return potential(mesh)(x, step._replace(material=step.material._replace(mu=mu)))
+
+    vertices, faces = icosphere(1)
+    patches = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), proximity.patches(vertices, faces))
+    search = jax.jit(jax.vmap(kernels.nearest_face, (None, None, 0)))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="operands do not fit"):
+        jax.block_until_ready(search(x, vertices.astype(np.float32), patches))
+    with pytest.raises(NotImplementedError, match="derivatives by positions and weights alone"):
+        jax.grad(lambda shapes: jnp.sum(kernels.blended(jnp.ones(2), shapes)))(jnp.ones((2, 3)))
 
     assert jax.grad(by_stiffness)(jnp.float32(1e4)) > 0
     with pytest.raises(NotImplementedError, match="derivatives by positions and weights alone"):
