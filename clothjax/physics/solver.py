@@ -56,7 +56,7 @@ def solve_step(
     """Minimise `incremental_potential.potential` over the vertices that are not pinned.
 
     The method is Newton's, with conjugate gradients on the exact Hessian and a line search. The conjugate gradients
-    stop at negative curvature. Their preconditioner is the 3 x 3 diagonal blocks of a positive semidefinite Hessian
+    stop at negative curvature. Their preconditioner is the inverse of a semidefinite Hessian's 3 x 3 diagonal blocks
     (see `hessians.blocks`). The minimum is a local one, of which folds have many: compare energies, not positions.
     Contact planes and the friction mask are those of `step`, so the potential is smooth.
 
@@ -91,12 +91,12 @@ def solve_step(
         energy, gradient, _ = _host(evaluate(x), free)
         iterations = 0
         while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
-            exact, semidefinite = hessians.blocks(x, step, mesh, pattern, config, laws)
-            if not (np.isfinite(exact).all() and np.isfinite(semidefinite).all()):
+            blocks, diagonal = hessians.blocks(x, step, mesh, pattern, config, laws)
+            if not (np.isfinite(blocks).all() and np.isfinite(diagonal).all()):
                 break
             # inexact far away, more exact as the gradient falls: the last iterations converge superlinearly
             forcing = min(0.1, np.sqrt(0.1 * np.linalg.norm(gradient) / weight))
-            direction = _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing)
+            direction = _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing)
             iterations += 1
             x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
             if not moved:
@@ -165,17 +165,24 @@ def to_float64(leaf: Array | Scalar) -> np.ndarray:
     return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
 
 
-def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) -> np.ndarray:
-    """Return a descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature."""
-    # with D = L L^T the diagonal blocks, solve (L^-1 H L^-T) y = -L^-1 g: no preconditioner inside the loop
-    root = np.linalg.inv(np.linalg.cholesky(np.asarray(semidefinite)[pattern.diagonal]))
-    rows = np.repeat(np.arange(len(root)), np.diff(pattern.indptr))
-    exact = np.asarray(exact) * (free[rows, :1] & free[pattern.indices, :1])[:, :, None]
-    scaled = root[rows] @ exact @ root[pattern.indices].transpose(0, 2, 1)
-    matrix = scipy.sparse.bsr_array((scaled, pattern.indices, pattern.indptr))
-    residual = -(root @ gradient[:, :, None]).reshape(-1)
-    solution, search = np.zeros_like(residual), residual.copy()
-    squared = residual @ residual
+def _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing) -> np.ndarray:
+    """Return a descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature.
+
+    Args:
+        blocks, diagonal: of `hessians.blocks`; the inverse of the second is the preconditioner.
+        free: [V, 3] bool, coordinates that move.
+    """
+    rows = np.repeat(np.arange(len(diagonal)), np.diff(pattern.indptr))
+    moving = (free[rows, 0] & free[pattern.indices, 0])[:, None, None]
+    matrix = scipy.sparse.bsr_array((np.where(moving, blocks, 0.0), pattern.indices, pattern.indptr))
+    inverse = np.linalg.inv(diagonal)
+
+    def preconditioned(residual: np.ndarray) -> np.ndarray:
+        return np.einsum("vab,vb->va", inverse, residual.reshape(-1, 3)).reshape(-1)
+
+    residual = -gradient.reshape(-1)
+    solution, search = np.zeros_like(residual), preconditioned(residual)
+    squared = residual @ search
     limit = forcing**2 * squared
     for iteration in range(CG_ITERATIONS):
         product = matrix @ search
@@ -187,11 +194,12 @@ def _conjugate_gradients(exact, semidefinite, gradient, free, pattern, forcing) 
         length = squared / curvature
         solution += length * search
         residual -= length * product
-        previous, squared = squared, residual @ residual
+        next_search = preconditioned(residual)
+        previous, squared = squared, residual @ next_search
         if squared < limit:
             break
-        search = residual + (squared / previous) * search
-    return (root.transpose(0, 2, 1) @ solution.reshape(-1, 3, 1))[:, :, 0]
+        search = next_search + (squared / previous) * search
+    return solution.reshape(-1, 3)
 
 
 def _line_search(evaluate, x, energy, gradient, direction, free):
