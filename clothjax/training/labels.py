@@ -28,7 +28,6 @@ NOISY = 0.2  # share of the frames whose code gets noise
 WILD = (2.0, 0.2)  # a code of Psi's with more energy than so often the held one's, plus so many J, is not followed
 LOST = 200.0  # J, from which on a frame is left out
 ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertices
-LARGE = 2000  # vertices, from which on blend shapes leave a CPU's cache; 1 016 do not, 4 065 do
 STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
 SAME = 0.85  # share of what Psi's code lacked in the last frame that a label also tries to start with
 PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
@@ -202,11 +201,7 @@ def make_collect(
     Args:
         device_mesh: each device takes a part of the simulations.
     """
-    # several simulations read the blend shapes together, but wait for the longest descent among them
-    together = sampling.ON_CPU if len(scene.garment.vertices) >= LARGE else 1
-    sample = sampling.make_sampler(
-        kernels.in_kernels(make_segment(scene, config)), device_mesh, together, elsewhere=ON_GPU
-    )
+    sample = sampling.make_sampler(kernels.in_kernels(make_segment(scene, config)), device_mesh, elsewhere=ON_GPU)
     clips = jax.tree.map(jnp.asarray, clips)
 
     def collect(policy: Policy, simulations: Simulation, seed: int, progress: Callable[[int], None]) -> Round:

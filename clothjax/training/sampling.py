@@ -15,12 +15,10 @@ from clothjax.files import damage
 from clothjax.training import devices, run_folder
 from clothjax.types import Array
 
-ON_CPU, ELSEWHERE = 4, 64  # sequences in one program, by device
+ON_CPU, ELSEWHERE = 4, 64  # sequences in one program, by device; they read blend shapes together
 
 
-def make_sampler(
-    sequence: Callable, device_mesh: Mesh | None = None, together: int = ON_CPU, elsewhere: int = ELSEWHERE
-) -> Callable:
+def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, elsewhere: int = ELSEWHERE) -> Callable:
     """Return a function that computes `sequence(one, *arguments)` for many, compiled once.
 
     Its arguments are `each`, the first arguments of the sequences with an axis [count], such as random keys; the other
@@ -31,8 +29,7 @@ def make_sampler(
     Args:
         sequence: a function that jax can transform; it returns a pytree of arrays.
         device_mesh: each device runs a part of them.
-        together: sequences in one program on a CPU, which all take as many steps as the longest of them.
-        elsewhere: sequences in one program on another device.
+        elsewhere: sequences in one program on a device that is not a CPU.
     """
     on_cpu = jax.default_backend() == "cpu"
     among = 1 if device_mesh is None else device_mesh.size
@@ -45,7 +42,7 @@ def make_sampler(
         each: Any, arguments: tuple, progress: Callable[[int], None] = lambda _: None, folder: Path | None = None
     ) -> Any:
         count = len(jax.tree.leaves(each)[0])
-        size = among * min(together if on_cpu else elsewhere, -(-count // among))
+        size = among * min(ON_CPU if on_cpu else elsewhere, -(-count // among))
         arguments = devices.replicate(arguments, device_mesh)
 
         def part_from(start: int):
