@@ -178,6 +178,9 @@ class ModelConfig:
     relaxation: int = 0
     """Jacobi steps down the stretching energy that end the decoder. They let blend shapes fold without stretching. Only
     with `stage2.forces`."""
+    relaxation_momentum: float = 0.0
+    """Share of the last step that such a step goes on with (heavy ball, Polyak 1964); its own part is longer by the
+    same share. Then as many steps reach farther."""
     felt: str = ""
     """The same garment with fewer vertices, by asset name or path. It feels the forces in place of the garment itself,
     and is its level of detail. Empty: the garment itself. Only with `stage2.forces`."""
@@ -197,6 +200,9 @@ class ModelConfig:
     def __post_init__(self):
         _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")
         _require(0 <= self.relaxation <= 16, f"relaxation must be 0 to 16, got {self.relaxation}")
+        _require(
+            0 <= self.relaxation_momentum < 1, f"relaxation_momentum must be 0 to 1, got {self.relaxation_momentum}"
+        )
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
         _require(len(self.convolution) > 0, "the convolution needs a block")
         _require(

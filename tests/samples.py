@@ -435,7 +435,12 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, meshes=(), 
     config = dataclasses.replace(
         config,
         model=dataclasses.replace(
-            config.model, decoder=(24, 16), decoder_skip=skip, blendshape_relu=not skip, relaxation=relaxation
+            config.model,
+            decoder=(24, 16),
+            decoder_skip=skip,
+            blendshape_relu=not skip,
+            relaxation=relaxation,
+            relaxation_momentum=0.5 if relaxation else 0.0,
         ),
         stage2=dataclasses.replace(config.stage2, forces=True, hidden=(32, 24)),
         physics=dataclasses.replace(config.physics, **physics),

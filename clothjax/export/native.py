@@ -27,7 +27,7 @@ from clothjax.types import Array, Material, Mesh, Motion, Rest
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; ...
-FORCED = 6  # ... and of one with forces
+FORCED = 7  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -126,8 +126,11 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
     spring = 3.0 * forces.DEPTH * physics.collision_stiffness  # N/m
-    rates = [1 / model.config.fps, weight, spring, physics.collision_offset, forces.HIGHEST, drape.DEEPEST, drape.REACH]
-    yield np.array(rates, np.float32)
+    yield np.array(
+        [1 / model.config.fps, weight, spring, physics.collision_offset, forces.HIGHEST, drape.DEEPEST, drape.REACH,
+         model.config.model.relaxation_momentum],
+        np.float32,
+    )  # fmt: skip
     stiffness = 0.0 if "bending" in physics.without else np.asarray(cloth.material.bending)
     yield _padded(cloth.mass)
     yield from _fabric(mesh, rest, cloth.material, cloth.mobility)

@@ -97,7 +97,7 @@ def follow(g: Graph, model: Model, latent: str, decoded: str, rows: str, advance
     else:
         garment = g("Reshape", decoded, shape)
         skinned = onnx_forces.moved(g, rows, garment)
-        placed = _relaxed(g, model, skinned, steps)
+        placed = _relaxed(g, model, skinned, steps, model.config.model.relaxation_momentum)
         back = _unapplied(g, rows, g("Sub", placed, skinned))
         canonical = g("Add", garment, back, name="next_garment")
     position = g("Transpose", placed, perm=[0, 2, 1], name="next_position")
@@ -125,11 +125,13 @@ def shown_outside(
 
     if felt is not None and felt.mesh is not None:
         steps = drape.relaxation_steps(model)
-        outside = _relaxed(g, model, g.skinned(garment, transforms, model.network.weights), steps, alone=True)
+        momentum = model.config.model.relaxation_momentum
+        outside = g.skinned(garment, transforms, model.network.weights)
+        outside = _relaxed(g, model, outside, steps, momentum, alone=True)
         point, normal = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in touched.vertices)
         of_shown = targets(outside, (point, normal))
         for _ in range(steps):
-            outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, alone=True)
+            outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, 0.0, alone=True)
         return _pushed_out(g, outside, *of_shown)
     of_vertices = targets(outside, touched.vertices)
     of_edges = None
@@ -143,7 +145,7 @@ def shown_outside(
         return _pushed_out(g, garment, *of_vertices)
 
     for _ in range(drape.relaxation_steps(model)):
-        outside = _relaxed(g, model, pushed_out(outside), 1)
+        outside = _relaxed(g, model, pushed_out(outside), 1, 0.0)
     outside = pushed_out(outside)
     if felt is None:
         return outside
@@ -170,7 +172,8 @@ def shown_apart(g: Graph, model: Model, garment: str, hung: Hung, transforms: st
         rows = onnx_forces.blended(g, transforms, np.asarray(model.network.weights))
         decoded = g.reshape(garment, 3, len(felt.around))
         skinned = onnx_forces.moved(g, rows, decoded)
-        placed = _relaxed(g, model, skinned, drape.relaxation_steps(model), alone=True)
+        momentum = model.config.model.relaxation_momentum
+        placed = _relaxed(g, model, skinned, drape.relaxation_steps(model), momentum, alone=True)
         back = _unapplied(g, rows, g("Sub", placed, skinned))
         return g.reshape(g("Add", decoded, back), 3 * len(felt.around))
     moved = g("Sub", hung.canonical, g.reshape(hung.decoded, 3, len(it.cloth.mass)))
@@ -208,7 +211,7 @@ def _middles(g: Graph, positions: str, edges: np.ndarray) -> str:
     return g("Mul", g("Add", start, end), np.float32(0.5))
 
 
-def _relaxed(g: Graph, model: Model, position: str, steps: int, alone: bool = False) -> str:
+def _relaxed(g: Graph, model: Model, position: str, steps: int, momentum: float, alone: bool = False) -> str:
     """Return positions [N, 3, V] m after some of the steps of `relaxation.relaxed`.
 
     Args:
@@ -220,12 +223,16 @@ def _relaxed(g: Graph, model: Model, position: str, steps: int, alone: bool = Fa
         assert it.predictor.felt is not None and it.predictor.felt.mesh is not None and it.cloth.shown is not None
         mesh, (rest, mobility) = it.predictor.felt.mesh, it.cloth.shown
     faces, mobility, longest = np.asarray(mesh.faces), np.asarray(mobility), np.float32(relaxation.LONGEST**-2)
+    momentum, before = np.float32(momentum), position
     for _ in range(steps):
         gradients = onnx_forces.stretching(g, rest, it.cloth.material, position, faces)
         pull = onnx_forces.at_vertices(g, gradients, [faces], len(mobility))
-        move = g("Mul", pull, -mobility)
+        move = g("Mul", pull, -(1 + momentum) * mobility)
         length = g("Sqrt", g("Add", g("Mul", g.dot(move, move), longest), np.float32(1.0)))
-        position = g("Add", position, g("Div", move, length))
+        move = g("Div", move, length)
+        if momentum > 0 and before is not position:
+            move = g("Add", move, g("Mul", g("Sub", position, before), momentum))
+        position, before = g("Add", position, move), position
     return position
 
 

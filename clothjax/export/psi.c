@@ -9,7 +9,7 @@
 #include <string.h>
 
 #define PLAIN 1           /* version of a file without forces; ... */
-#define FORCED 6          /* ... and with them */
+#define FORCED 7          /* ... and with them */
 #define ALIGN 64          /* bytes, of all arrays */
 #define FARTHEST 1e6f     /* m from the origin */
 #define MOST_JOINTS 1024
@@ -59,6 +59,7 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     float timestep, gravity;
     float stiffness, offset;                          /* N/m and m, of planes that are touched; ... */
     float highest, deepest, reach;                    /* ... m, raised, pushed, and far from an edge at most */
+    float momentum;                                   /* of relaxation */
     const float *mass;                                /* [vertices] */
     const int32_t *hinge;                             /* [4][hinges] */
     const float *bend, *angle;                        /* [hinges] */
@@ -109,6 +110,7 @@ struct psi_state {
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it feels raised */
     float *target;         /* how far outside of it a vertex is pushed to be shown */
     float *shown, *moved, *aim; /* [3], [3], [1] rows [vertices that are shown], if they are relaxed by themselves */
+    float *eased;          /* [3], what is relaxed, a step before */
     /* rows [edges, to a multiple of LANES] */
     float *between;        /* [3], the middles of edges */
     int32_t *nearest_between;
@@ -255,7 +257,7 @@ static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int re
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
     const int32_t *head = integers(r, 11);
-    const float *rates = floats(r, 7);
+    const float *rates = floats(r, 8);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
     const int32_t triangles = within(r, head[1], 0, MOST_ELEMENTS), shown = within(r, head[10], 0, MOST_ELEMENTS);
@@ -269,7 +271,8 @@ static void read_forces(reader *r, psi_model *m) {
     f->edge_clusters = within(r, head[8], 0, MOST_ELEMENTS / NEIGHBOURS);
     f->relaxation = within(r, head[9], 0, MOST_STEPS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
-    f->highest = rates[4], f->deepest = rates[5], f->reach = rates[6];
+    f->highest = rates[4], f->deepest = rates[5], f->reach = rates[6], f->momentum = rates[7];
+    if (!(f->momentum >= 0.0f && f->momentum < 1.0f)) r->sound = 0;
     f->mass = floats(r, padded(f->vertices));
     f->felt = read_fabric(r, f->vertices, triangles, f->relaxation > 0);
     f->hinge = indices(r, 4 * padded(f->hinges), f->vertices);
@@ -1144,18 +1147,28 @@ static void predict_from_forces(const psi_model *m, psi_state *s, int shown) {
     for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;
 }
 
-/* One step of relaxation of a garment [3][vertices], with as much room to `push` in: relaxation.relaxed. */
-static void ease(const fabric *f, float *x, float *push) {
+/* One step of relaxation of a garment [3][vertices] that was `last` before, with as much room to `push` in:
+   relaxation.relaxed. */
+static void ease(const fabric *f, float momentum, float *x, float *last, float *push) {
     const size_t wide = padded(f->vertices);
-    float *y = x + wide, *z = y + wide;
     memset(push, 0, 3 * wide * sizeof(float));
     push_stretching(f, x, push);
     for (size_t i = 0; i < wide; i++) {
-        const float a = f->mobility[i] * push[i], b = f->mobility[i] * push[wide + i],
-                    c = f->mobility[i] * push[2 * wide + i],
-                    share = 1.0f / sqrtf(1.0f + (a * a + b * b + c * c) / (LONGEST * LONGEST));
-        x[i] += share * a, y[i] += share * b, z[i] += share * c;
+        const float mobility = (1.0f + momentum) * f->mobility[i];
+        float move[3] = {mobility * push[i], mobility * push[wide + i], mobility * push[2 * wide + i]};
+        const float square = move[0] * move[0] + move[1] * move[1] + move[2] * move[2],
+                    share = 1.0f / sqrtf(1.0f + square / (LONGEST * LONGEST));
+        for (int c = 0; c < 3; c++) {
+            const float now = x[c * wide + i];
+            x[c * wide + i] = now + share * move[c] + momentum * (now - last[c * wide + i]);
+            last[c * wide + i] = now;
+        }
     }
+}
+
+static void ease_all(const forces *f, const fabric *of, float *x, float *last, float *push) {
+    memcpy(last, x, 3 * (size_t)padded(of->vertices) * sizeof(float));
+    for (int32_t n = 0; n < f->relaxation; n++) ease(of, f->momentum, x, last, push);
 }
 
 /* Adds to `canonical` what s->held has moved by from `before`, carried back: skinning.unapply_direction. */
@@ -1184,7 +1197,7 @@ static void relax(const forces *f, psi_state *s) {
     const size_t wide = padded(f->vertices);
     float *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
     memcpy(before, s->held, 3 * wide * sizeof(float));
-    for (int32_t n = 0; n < f->relaxation; n++) ease(&f->felt, s->held, s->force);
+    ease_all(f, &f->felt, s->held, s->eased, s->force);
     carry_back(f, s, before, canonical);
     for (size_t i = 0; i < 3 * wide; i++) s->garment[i] += canonical[i];
 }
@@ -1273,7 +1286,7 @@ static void lift(const psi_model *m, psi_state *s) {
     if (f->edge_clusters) find_targets(f, s->plane_between, s->between, edges, advance, s->target_between);
     for (int32_t n = 0; n < f->relaxation; n++) {
         push_held(f, s, advance);
-        ease(&f->felt, s->held, s->force);
+        ease(&f->felt, 0.0f, s->held, s->eased, s->force);
     }
     push_held(f, s, advance);
     if (m->apart) carry_back(f, s, s->position, canonical); /* what is shown takes part in it */
@@ -1334,14 +1347,14 @@ static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
     const size_t rows = padded(m->vertices);
     for (int32_t v = 0; v < m->vertices; v++)
         for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
-    for (int32_t n = 0; n < m->f.relaxation; n++) ease(&m->f.shown, s->shown, s->moved);
+    ease_all(&m->f, &m->f.shown, s->shown, s->eased, s->moved);
     for (int32_t v = 0; v < m->vertices; v++) {
         const float farthest = gap_shown(m, s, v) + m->f.deepest;
         s->aim[v] = farthest < m->f.offset ? farthest : m->f.offset;
     }
     for (int32_t n = 0; n < m->f.relaxation; n++) {
         push_shown(m, s);
-        ease(&m->f.shown, s->shown, s->moved);
+        ease(&m->f.shown, 0.0f, s->shown, s->eased, s->moved);
     }
     push_shown(m, s);
     for (int32_t v = 0; v < m->vertices; v++)
@@ -1440,6 +1453,7 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     s->shown = part(room, &used, 3 * alone);
     s->moved = part(room, &used, 3 * alone);
     s->aim = part(room, &used, alone);
+    s->eased = part(room, &used, 3 * (alone > vertices ? alone : vertices));
     const size_t edges = m->f.edge_clusters ? padded(m->f.edges) : 0;
     s->between = part(room, &used, 3 * edges);
     s->nearest_between = (int32_t *)part(room, &used, edges);

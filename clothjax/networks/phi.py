@@ -185,7 +185,8 @@ def relaxed(
     if config.relaxation == 0:
         return position
     mobility = relaxation.mobility(rest, material, mesh, free(garment))
-    return relaxation.relaxed(position, mobility, rest, material, mesh, config.relaxation)
+    steps = config.relaxation, config.relaxation_momentum
+    return relaxation.relaxed(position, mobility, rest, material, mesh, *steps)
 
 
 def shown(displaced: Array, scene: Scene, character: Character, window: Window, config: ModelConfig) -> Array:

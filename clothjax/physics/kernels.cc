@@ -237,35 +237,41 @@ static double edge_collision(const Elements &edges, const float *__restrict plac
   return energy;
 }
 
-// A Jacobi step (relaxation.relaxed): the move m = -mobility gradient, of which m / sqrt(1 + |m|^2 / longest^2) is
-// taken.
-static void relax(const Sheet &s, const float *mobility, float longest, const float *__restrict x, float *corners,
-                  float *__restrict g, float *__restrict next) {
+// Of a step of relaxation.relaxed.
+struct Relaxing {
+  const float *mobility;
+  float momentum, longest;
+};
+
+// The move m = -(1 + momentum) mobility gradient, of which m / sqrt(1 + |m|^2 / longest^2) is taken.
+static void relax(const Sheet &s, const Relaxing &by, const float *__restrict x, float *corners, float *__restrict g,
+                  float *__restrict next) {
   const size_t V = s.faces.vertices;
-  const float square = 1.0f / (longest * longest);
+  const float square = 1.0f / (by.longest * by.longest), further = -(1.0f + by.momentum);
   stretching(s, x, corners, g);
   for (size_t v = 0; v < V; v++) {
-    const float m = -mobility[v], a = m * g[v], b = m * g[V + v], c = m * g[2 * V + v];
+    const float m = further * by.mobility[v], a = m * g[v], b = m * g[V + v], c = m * g[2 * V + v];
     const float share = inverse_root(1.0f + (a * a + b * b + c * c) * square);
     next[v] = x[v] + share * a, next[V + v] = x[V + v] + share * b, next[2 * V + v] = x[2 * V + v] + share * c;
   }
 }
 
-// Its transpose at x: by + H M by, with the derivative M of the move by the gradient; both are symmetric.
-static void relax_back(const Sheet &s, const float *mobility, float longest, const float *__restrict x, float *corners,
-                       float *__restrict g, float *__restrict pushed, float *__restrict by) {
+// Its transpose at x: adds H M by to `to`, with the derivative M of the move by the gradient; both are symmetric.
+static void relax_back(const Sheet &s, const Relaxing &of, const float *__restrict x, float *corners,
+                       float *__restrict g, float *__restrict pushed, const float *__restrict by,
+                       float *__restrict to) {
   const size_t V = s.faces.vertices;
-  const float square = 1.0f / (longest * longest);
+  const float square = 1.0f / (of.longest * of.longest), further = -(1.0f + of.momentum);
   stretching(s, x, corners, g);
   for (size_t v = 0; v < V; v++) {
-    const float m = -mobility[v], a = m * g[v], b = m * g[V + v], c = m * g[2 * V + v];
+    const float m = further * of.mobility[v], a = m * g[v], b = m * g[V + v], c = m * g[2 * V + v];
     const float share = inverse_root(1.0f + (a * a + b * b + c * c) * square);
     const float along = (a * by[v] + b * by[V + v] + c * by[2 * V + v]) * square * share * share;
     pushed[v] = m * share * (by[v] - along * a), pushed[V + v] = m * share * (by[V + v] - along * b);
     pushed[2 * V + v] = m * share * (by[2 * V + v] - along * c);
   }
   stretching_along(s, x, pushed, corners, g);
-  for (size_t v = 0; v < 3 * V; v++) by[v] += g[v];
+  for (size_t v = 0; v < 3 * V; v++) to[v] += g[v];
 }
 
 // The garments of a batch that one jax.vmap made. An operand that they share has an axis of 1, or none.
@@ -342,40 +348,50 @@ static ffi::Error EdgeCollision(Floats x, Integers corner, Integers place, Float
 }
 
 static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Integers place, Floats inverse, Floats weight,
-                        Floats mu, Floats lam, float longest, int32_t steps, Result after) {
+                        Floats mu, Floats lam, int32_t steps, float momentum, float longest, Result after) {
   const Elements faces = elements(corner, place);
   const size_t V = faces.vertices, n = faces.count, count = after->element_count() / (3 * V * steps);
   if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&weight, n}, {&mu, n}, {&lam, n}})) return unfit();
   std::vector<float> corners(3 * (3 * n + 1)), g(3 * V);
   for (size_t b = 0; b < count; b++) {
     const Sheet s = sheet(faces, inverse, weight, mu, lam, b);
-    const float *from = row(x, 3 * V, b);
+    const Relaxing by = {row(mobility, V, b), momentum, longest};
+    const float *from = row(x, 3 * V, b), *before = from;
     for (int32_t i = 0; i < steps; i++) {
       float *to = after->typed_data() + 3 * V * (steps * b + i);
-      relax(s, row(mobility, V, b), longest, from, corners.data(), g.data(), to);
-      from = to;
+      relax(s, by, from, corners.data(), g.data(), to);
+      for (size_t v = 0; v < 3 * V; v++) to[v] += momentum * (from[v] - before[v]);
+      before = from, from = to;
     }
   }
   return ffi::Error::Success();
 }
 
 static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats after, Floats mobility, Integers corner, Integers place,
-                            Floats inverse, Floats weight, Floats mu, Floats lam, float longest, int32_t steps,
-                            Result by) {
+                            Floats inverse, Floats weight, Floats mu, Floats lam, int32_t steps, float momentum,
+                            float longest, Result by) {
   const Elements faces = elements(corner, place);
   const size_t V = faces.vertices, n = faces.count, count = by->element_count() / (3 * V);
   if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&after, 3 * V * steps}, {&mobility, V}, {&inverse, 4 * n},
                    {&weight, n}, {&mu, n}, {&lam, n}}))
     return unfit();
-  std::vector<float> corners(3 * (3 * n + 1)), g(3 * V), pushed(3 * V);
+  std::vector<float> corners(3 * (3 * n + 1)), g(3 * V), pushed(3 * V), later(3 * V), held(3 * V);
   for (size_t b = 0; b < count; b++) {
     const Sheet s = sheet(faces, inverse, weight, mu, lam, b);
     const float *passed = row(after, 3 * V * steps, b);
+    const Relaxing of = {row(mobility, V, b), momentum, longest};
     float *to = by->typed_data() + 3 * V * b;
     std::memcpy(to, row(cotangent, 3 * V, b), 3 * V * sizeof(float));
+    held.assign(3 * V, 0.0f);
     for (int32_t i = steps - 1; i >= 0; i--) {
+      // `to` is by the positions after step i; those before it also took part in step i + 1, by `held`
       const float *at = i ? passed + 3 * V * (i - 1) : row(x, 3 * V, b);
-      relax_back(s, row(mobility, V, b), longest, at, corners.data(), g.data(), pushed.data(), to);
+      std::memcpy(later.data(), to, 3 * V * sizeof(float));
+      relax_back(s, of, at, corners.data(), g.data(), pushed.data(), later.data(), to);
+      for (size_t v = 0; v < 3 * V; v++) {
+        to[v] += held[v] + (i ? momentum * later[v] : 0.0f);  // the first step has none before it
+        held[v] = -momentum * later[v];
+      }
     }
   }
   return ffi::Error::Success();
@@ -535,10 +551,12 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothEdgeCollision, EdgeCollision, ffi::Ffi::Bind(
     .Attr<float>("stiffness").Attr<float>("offset").Ret<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelax, Relax, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
-    .Arg<Floats>().Attr<float>("longest").Attr<int32_t>("steps").Ret<Floats>());
+    .Arg<Floats>().Attr<int32_t>("steps").Attr<float>("momentum")
+    .Attr<float>("longest").Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelaxBack, RelaxBack, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>()
-    .Arg<Floats>().Arg<Floats>().Arg<Floats>().Attr<float>("longest").Attr<int32_t>("steps").Ret<Floats>());
+    .Arg<Floats>().Arg<Floats>().Arg<Floats>().Attr<int32_t>("steps").Attr<float>("momentum")
+    .Attr<float>("longest").Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothSolve, Solve, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFace, NearestFace, ffi::Ffi::Bind()

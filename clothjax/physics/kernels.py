@@ -174,6 +174,7 @@ def relaxed(
     material: Material,
     mesh: Mesh,
     steps: int,
+    momentum: float,
     longest: float,
 ) -> Float[Array, "V 3"]:
     """Return what `relaxation.relaxed` does.
@@ -182,30 +183,47 @@ def relaxed(
         longest: m, that a vertex moves in a step at most.
     """
     faces = elements(mesh.faces, len(position))
-    return _relaxed(position, (mobility, *faces, *_sheet(rest, material)), steps, longest)
+    settings = Relaxing(steps, momentum, longest)
+    return _relaxed(position, (mobility, *faces, *_sheet(rest, material)), settings)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
-def _relaxed(position: Array, operands: tuple, steps: int, longest: float) -> Array:
-    return _relaxed_in_turn(position, operands, steps, longest)[-1].T
+class Relaxing(NamedTuple):
+    """Settings of `relaxed`."""
+
+    steps: int
+    momentum: float
+    longest: float  # m
+
+    def attributes(self) -> dict[str, np.generic]:
+        """Return them as the kernels read them."""
+        return {
+            "steps": np.int32(self.steps),
+            "momentum": np.float32(self.momentum),
+            "longest": np.float32(self.longest),
+        }
 
 
-def _relaxed_in_turn(position: Array, operands: tuple, steps: int, longest: float) -> Array:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _relaxed(position: Array, operands: tuple, settings: Relaxing) -> Array:
+    return _relaxed_in_turn(position, operands, settings)[-1].T
+
+
+def _relaxed_in_turn(position: Array, operands: tuple, settings: Relaxing) -> Array:
     """Return the positions after each step, [steps, 3, V]."""
-    settings = {"longest": np.float32(longest), "steps": np.int32(steps)}
-    return _call("ClothRelax", [(steps, *position.shape[::-1])], position.T, *operands, **settings)[0]
+    shape = (settings.steps, *position.shape[::-1])
+    return _call("ClothRelax", [shape], position.T, *operands, **settings.attributes())[0]
 
 
-def _relaxed_forward(position, operands, steps: int, longest: float) -> tuple[Array, tuple]:
+def _relaxed_forward(position, operands, settings: Relaxing) -> tuple[Array, tuple]:
     position, operands = position.value, _constant(operands)
-    after = _relaxed_in_turn(position, operands, steps, longest)
+    after = _relaxed_in_turn(position, operands, settings)
     return after[-1].T, (position, after, operands)
 
 
-def _relaxed_backward(steps: int, longest: float, passed: tuple, cotangent: Array) -> tuple[Array, None]:
+def _relaxed_backward(settings: Relaxing, passed: tuple, cotangent: Array) -> tuple[Array, None]:
     position, after, operands = passed
-    settings = {"longest": np.float32(longest), "steps": np.int32(steps)}
-    (by,) = _call("ClothRelaxBack", [position.shape[::-1]], cotangent.T, position.T, after, *operands, **settings)
+    given = (cotangent.T, position.T, after, *operands)
+    (by,) = _call("ClothRelaxBack", [position.shape[::-1]], *given, **settings.attributes())
     return by.T, None
 
 

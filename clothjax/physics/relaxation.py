@@ -1,4 +1,4 @@
-"""Relaxation of a decoded garment: a few Jacobi steps down its stretching energy (METHOD.md, Decoder).
+"""Relaxation of a decoded garment: a few steps down its stretching energy (METHOD.md, Decoder).
 
 A linear span of blend shapes is stiffer than cloth: a fold in it stretches triangles, unless it has the small
 displacements in the plane that go with the fold. These steps find them. They reach a few edges far; what is longer is
@@ -82,17 +82,20 @@ def relaxed(
     material: Material,
     mesh: Mesh,
     steps: int,
+    momentum: float = 0.0,
 ) -> Float[Array, "V 3"]:
     """Return positions [V, 3] m after some steps down the stretching energy.
 
     Args:
-        mobility: [V] m/N, of `mobility`.
+        mobility: [V] m/N, of `mobility`; a step is longer than that by `momentum`.
+        momentum: share of the last step that each goes on with. Its limit of stability rises as its length does.
     """
     if steps > 0 and kernels.used(position, mesh):
-        return kernels.relaxed(position, mobility, rest, material, mesh, steps, LONGEST)
-    elastic = Elastic(rest.inverse, rest.face_area, material.mu, material.lam)
+        return kernels.relaxed(position, mobility, rest, material, mesh, steps, momentum, LONGEST)
+    elastic, before = Elastic(rest.inverse, rest.face_area, material.mu, material.lam), position
     for _ in range(steps):
-        move = -mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)
+        move = -(1.0 + momentum) * mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)
         length = jnp.sum(move * move, axis=-1, keepdims=True)
-        position += move / jnp.sqrt(1.0 + length / LONGEST**2)
+        move = move / jnp.sqrt(1.0 + length / LONGEST**2) + momentum * (position - before)
+        position, before = position + move, position
     return position

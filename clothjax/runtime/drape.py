@@ -85,7 +85,7 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
         return contact_search.pushed_out(garment, *of_vertices, DEEPEST)
 
     for _ in range(relaxation_steps(model)):
-        outside = _relaxed(model, pushed_out(outside), 1)
+        outside = _relaxed(model, pushed_out(outside), 1, 0.0)
     outside = pushed_out(outside)
     if parts.felt is None:
         return outside
@@ -106,7 +106,8 @@ def _relaxed_outside(model: Model, garment: Array, planes: Contact, felt: Felt) 
     cloth = model.wearer.cloth
     assert cloth is not None and cloth.shown is not None and felt.mesh is not None
     (rest, mobility), mesh, steps = cloth.shown, felt.mesh, relaxation_steps(model)
-    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, steps)
+    momentum = model.config.model.relaxation_momentum
+    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, steps, momentum)
     point, normal = planes.point_next[felt.nearest], planes.normal_next[felt.nearest]
     gap = contact_search.distance(garment, point, normal)
     apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
@@ -216,16 +217,17 @@ def _hung(model: Model, latent: Array, transforms: Array) -> tuple[Array, Array]
     position, steps = _skin(_rows(felt.weights, transforms), garment).T, relaxation_steps(model)
     if steps == 0:
         return garment, position
-    relaxed = _relaxed(model, position, steps)
+    relaxed = _relaxed(model, position, steps, model.config.model.relaxation_momentum)
     back = skinning.unapply_direction(_matrices(model, transforms), relaxed - position)
     return garment + back.T, relaxed
 
 
-def _relaxed(model: Model, position: Array, steps: int) -> Array:
+def _relaxed(model: Model, position: Array, steps: int, momentum: float) -> Array:
     """Return the garment that feels [V, 3] m after some steps of relaxation."""
     cloth = model.wearer.cloth
     assert cloth is not None and cloth.mobility is not None
-    return relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, _forces(model).mesh, steps)
+    mesh = _forces(model).mesh
+    return relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, mesh, steps, momentum)
 
 
 def _matrices(model: Model, transforms: Array) -> Array:

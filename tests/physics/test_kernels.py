@@ -64,14 +64,16 @@ def test_energies_and_their_gradients_are_those_of_jax(crumpled, term):
 
 
 @needs_compilers
-def test_relaxation_and_its_derivative_are_those_of_jax(crumpled):
+@pytest.mark.parametrize("momentum", [0.0, 0.6])
+def test_relaxation_and_its_derivative_are_those_of_jax(crumpled, momentum):
     x, mesh, step = crumpled
     free = np.arange(len(x)) % 7 > 0
     cotangent = np.random.default_rng(1).normal(size=x.shape)
 
     def relaxed(x, step, cotangent):
         mobility = relaxation.mobility(step.rest, step.material, mesh, jnp.asarray(free, x.dtype))
-        new, pull = jax.vjp(lambda x: relaxation.relaxed(x, mobility, step.rest, step.material, mesh, 3), x)
+        steps = 4, momentum
+        new, pull = jax.vjp(lambda x: relaxation.relaxed(x, mobility, step.rest, step.material, mesh, *steps), x)
         return new, pull(cotangent)[0]
 
     with jax.enable_x64(True):

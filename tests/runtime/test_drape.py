@@ -119,8 +119,10 @@ def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
     )
     window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
     code = 0.5 * jax.random.normal(jax.random.key(2), model.network.code_bounds.low.shape)
-    twice = dataclasses.replace(config.model, relaxation=6)  # as what is pushed out is relaxed too
-    expected = phi.decode(coarse.garment, scene, character, code, window, twice)
+    expected = phi.decode(coarse.garment, scene, character, code, window, config.model)
+    mobility = relaxation.mobility(character.rest, character.material, scene.mesh, phi.free(scene.garment))
+    # as what is pushed out is relaxed too
+    expected = relaxation.relaxed(expected, mobility, character.rest, character.material, scene.mesh, 3)
     rotations, joints = skinning.forward_kinematics(
         pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
     )
@@ -503,7 +505,7 @@ def test_what_is_relaxed_by_itself_is_shown_outside_of_what_is_touched(coarse, m
         _, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
         state, vertices = inference.step(model, state, pose(motion, t))
         cloth, garment = model.wearer.cloth, drape.shown(model, state.latent, transforms)
-        free = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 3)
+        free = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 3, 0.5)
         planes = (row[felt.nearest] for row in (touched.vertices.point_next, touched.vertices.normal_next))
         point, normal = planes
         apart = contact_search.distance(free, point, normal)
