@@ -223,15 +223,15 @@ def _relaxed(g: Graph, model: Model, position: str, steps: int, momentum: float,
         assert it.predictor.felt is not None and it.predictor.felt.mesh is not None and it.cloth.shown is not None
         mesh, (rest, mobility) = it.predictor.felt.mesh, it.cloth.shown
     faces, mobility, longest = np.asarray(mesh.faces), np.asarray(mobility), np.float32(relaxation.LONGEST**-2)
-    momentum, before = np.float32(momentum), position
+    before, share = position, np.float32(momentum)
     for _ in range(steps):
         gradients = onnx_forces.stretching(g, rest, it.cloth.material, position, faces)
         pull = onnx_forces.at_vertices(g, gradients, [faces], len(mobility))
-        move = g("Mul", pull, -(1 + momentum) * mobility)
+        move = g("Mul", pull, -(1 + share) * mobility)
         length = g("Sqrt", g("Add", g("Mul", g.dot(move, move), longest), np.float32(1.0)))
         move = g("Div", move, length)
         if momentum > 0 and before is not position:
-            move = g("Add", move, g("Mul", g("Sub", position, before), momentum))
+            move = g("Add", move, g("Mul", g("Sub", position, before), share))
         position, before = g("Add", position, move), position
     return position
 

@@ -194,6 +194,9 @@ def _dihedral_angle(edge: Array, left: Array, right: Array) -> tuple[Array, Arra
     size = jnp.max(jnp.abs(jnp.stack([edge, left, right])))
     flat = jnp.minimum(*areas) <= (energies.SLIVER * size * size) ** 2  # as in the energy: a face of hardly any area
 
+    def outer(one: Array, other: Array) -> Array:
+        return one[:, None] * other[None]
+
     def times_cross(matrix: Array, vector: Array) -> Array:  # M [v]x, so that M [v]x w = M (v x w)
         return jnp.cross(matrix, vector[None])
 
@@ -202,14 +205,14 @@ def _dihedral_angle(edge: Array, left: Array, right: Array) -> tuple[Array, Arra
         scale = jnp.where(flat, 0.0, 1.0 / jnp.where(flat, 1.0, area))
         # the normal over its square, and how that changes with the normal
         over = scale * normal
-        change = scale * jnp.eye(3, dtype=edge.dtype) - 2.0 * jnp.outer(over, over)
+        change = scale * jnp.eye(3, dtype=edge.dtype) - 2.0 * outer(over, over)
         turning = sign * times_cross(change, other)
         share = jnp.sum(other * along)
         by_edge += share * over
-        of_edge += jnp.outer(over, (other - share * along) / length) + share * turning
+        of_edge += outer(over, other - share * along) / length + share * turning
         slopes.append(-length * over)
         own.append(sign * length * times_cross(change, edge))
-        mixed.append(-jnp.outer(over, along) - length * turning)
+        mixed.append(-outer(over, along) - length * turning)
     zero = jnp.zeros_like(own[0])
     blocks = [[of_edge, mixed[0].T, mixed[1].T], [mixed[0], own[0], zero], [mixed[1], zero, own[1]]]
     return jnp.stack([by_edge, *slopes]), jnp.stack([jnp.stack(row) for row in blocks])
