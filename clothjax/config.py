@@ -200,9 +200,8 @@ class ModelConfig:
     def __post_init__(self):
         _require(self.width > 0 and self.latent > 0 and self.blendshapes > 0, "sizes must be > 0")
         _require(0 <= self.relaxation <= 16, f"relaxation must be 0 to 16, got {self.relaxation}")
-        _require(
-            0 <= self.relaxation_momentum < 1, f"relaxation_momentum must be 0 to 1, got {self.relaxation_momentum}"
-        )
+        momentum = self.relaxation_momentum
+        _require(0 <= momentum < 1, f"relaxation_momentum must be at least 0 and below 1, got {momentum}")
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
         _require(len(self.convolution) > 0, "the convolution needs a block")
         _require(

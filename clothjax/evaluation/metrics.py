@@ -24,7 +24,7 @@ from clothjax.simulation.reference import problem
 from clothjax.simulation.scene import Scene
 from clothjax.types import Array, Body, Pose
 
-SAME = 1e-6  # m; of starts that are as near, one is solved from: skinning holds what it had
+NEAR = 1e-5  # m; of starts that are nearer, one is solved from: skinning holds what it had
 SPAN_STEPS, SPAN_BOUND = 100, 1.0  # steps, and m a step, of the search in the span of the blend shapes
 
 
@@ -75,7 +75,7 @@ def step_measures(
         step, skinned, persistent, advance = state(character, trajectory[frame - 1], trajectory[frame], around, pushed)
         new = trajectory[frame + 1] + advance[None]
         # two starts, the better end: folds have many minima
-        same = float(jnp.max(jnp.abs(new - persistent))) < SAME
+        same = float(jnp.max(jnp.abs(new - persistent))) < NEAR
         ends = [
             solver.solve_step(begin, step, scene.mesh, scene.garment.pinned, config.physics)
             for begin in ((new,) if same else (new, persistent))

@@ -29,7 +29,7 @@
 #define STILL 2.5e-5f     /* of rotation matrices, and in m: a pose that changes by less stands still */
 #define AWAKE 60          /* frames that the cloth moves freely for on a body that stands still; then ... */
 #define SLOWING 0.95f     /* ... in each frame the change of the code shrinks by this */
-#define LONGEST 0.005f    /* m, that a vertex moves in a step of relaxation at most */
+#define LONGEST 0.005f    /* m, by which the gradient moves a vertex in a step of relaxation at most */
 #define FLAT 1e-3f        /* least determinant of a transform that is inverted */
 
 typedef struct { /* y = bias + scale * (weights (gain * x)); without inputs the bias alone */

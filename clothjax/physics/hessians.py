@@ -25,7 +25,6 @@ class Structure(NamedTuple):
 
     indptr: np.ndarray  # [V + 1] int32, where the blocks of each vertex's row begin
     indices: np.ndarray  # [N] int32, column of each block
-    diagonal: np.ndarray  # [V] int32, the blocks on the diagonal
     gather: scipy.sparse.csr_array  # [N, P], one where block n sums the block of an element's pair of corners
 
 
@@ -44,7 +43,7 @@ def structure(step: TimeStep, mesh: Mesh) -> Structure:
         (np.ones(len(key)), (target.reshape(-1), np.arange(len(key)))), shape=(len(blocks), len(key))
     )
     indptr = np.searchsorted(row, np.arange(count + 1))
-    return Structure(indptr.astype(np.int32), column.astype(np.int32), np.flatnonzero(row == column), gather)
+    return Structure(indptr.astype(np.int32), column.astype(np.int32), gather)
 
 
 def _corners(step: TimeStep, mesh: Mesh) -> list[np.ndarray]:

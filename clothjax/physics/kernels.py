@@ -180,7 +180,7 @@ def relaxed(
     """Return what `relaxation.relaxed` does.
 
     Args:
-        longest: m, that a vertex moves in a step at most.
+        longest: m, that the gradient moves a vertex by in a step at most.
     """
     faces = elements(mesh.faces, len(position))
     settings = Relaxing(steps, momentum, longest)

@@ -8,7 +8,7 @@
 #include <limits>
 #include <vector>
 
-constexpr size_t WIDTH = 16;  // triangles of a row
+constexpr size_t WIDTH = 16;  // numbers of a vector; triangles of a row
 
 struct Row {
   float at[9][WIDTH];  // the first corner, and the other two from there

@@ -16,7 +16,7 @@ from clothjax.physics import energies, kernels
 from clothjax.types import Array, Material, Mesh, Rest
 
 RATE = 0.8  # of a Jacobi step; above 1.3 the shortest waves of a regular mesh grow
-LONGEST = 0.005  # m, that a vertex moves in a step at most: far out of shape the cloth is many times as stiff
+LONGEST = 0.005  # m, by which the gradient moves a vertex at most: far out of shape cloth is many times as stiff
 
 
 class Elastic(NamedTuple):
@@ -82,7 +82,7 @@ def relaxed(
     material: Material,
     mesh: Mesh,
     steps: int,
-    momentum: float = 0.0,
+    momentum: float,
 ) -> Float[Array, "V 3"]:
     """Return positions [V, 3] m after some steps down the stretching energy.
 
@@ -96,6 +96,8 @@ def relaxed(
     for _ in range(steps):
         move = -(1.0 + momentum) * mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)
         length = jnp.sum(move * move, axis=-1, keepdims=True)
-        move = move / jnp.sqrt(1.0 + length / LONGEST**2) + momentum * (position - before)
+        move = move / jnp.sqrt(1.0 + length / LONGEST**2)
+        if momentum > 0:
+            move += momentum * (position - before)
         position, before = position + move, position
     return position

@@ -113,7 +113,7 @@ def _relaxed_outside(model: Model, garment: Array, planes: Contact, felt: Felt) 
     apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
     for _ in range(steps):
         garment = contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
-        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, 1)
+        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, 1, 0.0)
     return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
 
 

@@ -94,7 +94,7 @@ def of_relaxed(mesh):
         mobility = relaxation.mobility(rest, cloth, mesh, jnp.ones(len(x)))
 
         def energy(x):
-            return potential(mesh)(relaxation.relaxed(x, mobility, rest, cloth, mesh, 2), own)
+            return potential(mesh)(relaxation.relaxed(x, mobility, rest, cloth, mesh, 2, 0.3), own)
 
         return jax.value_and_grad(energy)(x)
 

@@ -234,8 +234,6 @@ def test_structure_holds_every_pair_of_neighbours_once():
         expected[np.ix_(both, both)] = True
     row = np.repeat(np.arange(36), np.diff(pattern.indptr))
     assert len(row) == expected.sum() > apart and expected[row, pattern.indices].all()
-    np.testing.assert_array_equal(row[pattern.diagonal], np.arange(36))
-    np.testing.assert_array_equal(pattern.indices[pattern.diagonal], np.arange(36))
 
 
 def test_mistakes_are_named():

@@ -122,7 +122,7 @@ def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
     expected = phi.decode(coarse.garment, scene, character, code, window, config.model)
     mobility = relaxation.mobility(character.rest, character.material, scene.mesh, phi.free(scene.garment))
     # as what is pushed out is relaxed too
-    expected = relaxation.relaxed(expected, mobility, character.rest, character.material, scene.mesh, 3)
+    expected = relaxation.relaxed(expected, mobility, character.rest, character.material, scene.mesh, 3, 0.0)
     rotations, joints = skinning.forward_kinematics(
         pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
     )
