@@ -202,6 +202,7 @@ class ModelConfig:
         _require(0 <= self.relaxation <= 16, f"relaxation must be 0 to 16, got {self.relaxation}")
         momentum = self.relaxation_momentum
         _require(0 <= momentum < 1, f"relaxation_momentum must be at least 0 and below 1, got {momentum}")
+        _require(momentum == 0 or self.relaxation > 0, "relaxation_momentum needs relaxation > 0")
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
         _require(len(self.convolution) > 0, "the convolution needs a block")
         _require(

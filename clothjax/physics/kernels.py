@@ -110,7 +110,8 @@ def edge_collision(
         offset: m.
     """
     operands = (*elements(mesh.edges, len(position)), contact.place, contact.point_next.T, contact.normal_next.T)
-    return _energy(position, operands, "ClothEdgeCollision", (("stiffness", stiffness), ("offset", offset)))
+    settings = (("stiffness", np.float32(stiffness)), ("offset", np.float32(offset)))
+    return _energy(position, operands, "ClothEdgeCollision", settings)
 
 
 def elements(corners: Array, vertices: int) -> Elements:
@@ -129,7 +130,7 @@ def _sheet(rest: Rest, material: Material) -> Sheet:
     return Sheet(inverse, weight, mu, lam)
 
 
-Settings = tuple[tuple[str, float], ...]
+Settings = tuple[tuple[str, np.generic], ...]  # of a kernel, by name
 
 
 def _call(name: str, shapes: list[tuple[int, ...]], *operands: Array, **attributes: np.generic) -> Sequence[Array]:
@@ -144,8 +145,7 @@ def _energy(position: Array, operands: tuple, name: str, settings: Settings = ()
 
 
 def _energy_and_gradient(position: Array, operands: tuple, name: str, settings: Settings) -> Sequence[Array]:
-    attributes = {key: np.float32(value) for key, value in settings}
-    return _call(name, [(), position.shape[::-1]], position.T, *operands, **attributes)
+    return _call(name, [(), position.shape[::-1]], position.T, *operands, **dict(settings))
 
 
 def _energy_forward(position, operands, name: str, settings: Settings) -> tuple[Array, Array]:
@@ -183,47 +183,31 @@ def relaxed(
         longest: m, that the gradient moves a vertex by in a step at most.
     """
     faces = elements(mesh.faces, len(position))
-    settings = Relaxing(steps, momentum, longest)
+    settings = (("steps", np.int32(steps)), ("momentum", np.float32(momentum)), ("longest", np.float32(longest)))
     return _relaxed(position, (mobility, *faces, *_sheet(rest, material)), settings)
 
 
-class Relaxing(NamedTuple):
-    """Settings of `relaxed`."""
-
-    steps: int
-    momentum: float
-    longest: float  # m
-
-    def attributes(self) -> dict[str, np.generic]:
-        """Return them as the kernels read them."""
-        return {
-            "steps": np.int32(self.steps),
-            "momentum": np.float32(self.momentum),
-            "longest": np.float32(self.longest),
-        }
-
-
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _relaxed(position: Array, operands: tuple, settings: Relaxing) -> Array:
+def _relaxed(position: Array, operands: tuple, settings: Settings) -> Array:
     return _relaxed_in_turn(position, operands, settings)[-1].T
 
 
-def _relaxed_in_turn(position: Array, operands: tuple, settings: Relaxing) -> Array:
+def _relaxed_in_turn(position: Array, operands: tuple, settings: Settings) -> Array:
     """Return the positions after each step, [steps, 3, V]."""
-    shape = (settings.steps, *position.shape[::-1])
-    return _call("ClothRelax", [shape], position.T, *operands, **settings.attributes())[0]
+    shape = int(dict(settings)["steps"]), *position.shape[::-1]
+    return _call("ClothRelax", [shape], position.T, *operands, **dict(settings))[0]
 
 
-def _relaxed_forward(position, operands, settings: Relaxing) -> tuple[Array, tuple]:
+def _relaxed_forward(position, operands, settings: Settings) -> tuple[Array, tuple]:
     position, operands = position.value, _constant(operands)
     after = _relaxed_in_turn(position, operands, settings)
     return after[-1].T, (position, after, operands)
 
 
-def _relaxed_backward(settings: Relaxing, passed: tuple, cotangent: Array) -> tuple[Array, None]:
+def _relaxed_backward(settings: Settings, passed: tuple, cotangent: Array) -> tuple[Array, None]:
     position, after, operands = passed
     given = (cotangent.T, position.T, after, *operands)
-    (by,) = _call("ClothRelaxBack", [position.shape[::-1]], *given, **settings.attributes())
+    (by,) = _call("ClothRelaxBack", [position.shape[::-1]], *given, **dict(settings))
     return by.T, None
 
 

@@ -32,6 +32,5 @@ def test_psi_is_near_phi_in_the_quickstart(report):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(raises=AssertionError, reason="0.66, as RESULTS.md says: ridge regression of few labels is a drag")
 def test_psi_of_the_quickstart_swings(report):
     assert report["evaluation"]["psi"]["swing_ratio"] >= 0.7

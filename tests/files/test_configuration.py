@@ -77,6 +77,7 @@ def test_forces_need_a_moving_body_and_phis_descent(other, reason):
         ({"model": {"relaxation": 2}, "stage2": {"forces": False}}, r"model\.relaxation needs stage2\.forces"),
         ({"model": {"relaxation": 17}, "stage2": {"forces": True}}, "relaxation must be 0 to 16, got 17"),
         ({"model": {"relaxation": -1}, "stage2": {"forces": True}}, "relaxation must be 0 to 16, got -1"),
+        ({"model": {"relaxation_momentum": 0.5}}, "relaxation_momentum needs relaxation > 0"),
         ({"model": {"relaxation_momentum": 1.0}}, r"relaxation_momentum must be at least 0 and below 1, got 1\.0"),
         ({"model": {"relaxation_momentum": -0.1}}, r"relaxation_momentum must be at least 0 and below 1, got -0\.1"),
     ],

@@ -166,10 +166,11 @@ def test_faces_of_hardly_any_area_have_the_hessian_of_the_energy():
     assert np.isfinite(diagonal).all()
 
 
-def test_the_semidefinite_hessian_is_exact_under_tension():
-    """Flat and pulled everywhere, without friction: nothing was cut off."""
+@pytest.mark.parametrize("contact", [{}, {"ground": 1e-3, "edges": True, "self_contact": True}])
+def test_the_semidefinite_hessian_is_exact_under_tension(contact):
+    """Flat and pulled everywhere, without friction, free or in the ground: nothing was cut off."""
     vertices, mesh = sheet()
-    exact, diagonal = hessian_of(1.05 * vertices, time_step(vertices, mesh), mesh)
+    exact, diagonal = hessian_of(1.05 * vertices, time_step(vertices, mesh, **contact), mesh)
     own = exact.reshape(len(vertices), 3, len(vertices), 3)[np.arange(len(vertices)), :, np.arange(len(vertices))]
     np.testing.assert_allclose(diagonal, own, atol=1e-9 * np.abs(exact).max())
 

@@ -197,12 +197,12 @@ def collect(toy):
     return labels.make_collect(experiment.scene, clips, experiment.config)
 
 
-def collected(toy, collect, state, simulations=None, seed=0) -> Round:
+def collected(toy, collect, state, simulations=None, seed=0, progress=lambda _: None) -> Round:
     experiment, clips, params, _ = toy
     if simulations is None:
         simulations = labels.begin(experiment.scene, clips, experiment.config)
     policy = labels.Policy(state.params, state.normalizers, params["garment"], params["inverse_hessian"])
-    return collect(policy, simulations, seed, lambda _: None)
+    return collect(policy, simulations, seed, progress)
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +236,9 @@ def test_labels_are_compiled_for_once_whatever_a_policy_comes_from(toy, collect,
 @pytest.mark.slow
 def test_labels_are_the_same_of_several_simulations_in_one_program(toy, finished, monkeypatch):
     monkeypatch.setattr(labels.sampling, "ON_CPU", 1)
-    alone = collected(toy, labels.make_collect(toy[0].scene, toy[1], toy[0].config), toy[3])
+    done = []
+    alone = collected(toy, labels.make_collect(toy[0].scene, toy[1], toy[0].config), toy[3], progress=done.append)
+    assert done == [1, 2]
     np.testing.assert_allclose(alone.labels.held[::5], finished.labels.held[::5], rtol=1e-3)
     np.testing.assert_allclose(alone.labels.least[::5], finished.labels.least[::5], rtol=1e-2, atol=1e-4)
 
