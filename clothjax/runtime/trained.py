@@ -1,9 +1,9 @@
 """Trained models: in the checkpoints of a run, or packed into the small file that a garment is shipped as.
 
 A packed model is a folder with `model.npz` and `config.yaml`; a `report.json` may say how it was trained. Large
-arrays are stored in eight bits, with a scale for each run of `RUN` entries (`NAME` and `NAME|scale`). The
-preconditioner is in half precision, all else as it is. The whitening of a Psi with forces is the preconditioner's root,
-which needs all of its bits.
+arrays are stored in eight bits, with a scale for each run of `RUN` entries (`NAME` and `NAME|scale`), and all is
+deflated. Steps of blend shapes are no finer than `FINEST` tells, for most shapes move little. Of the preconditioner
+there is the lower triangle, in half precision; the whitening of a Psi with forces is its root, which needs all bits.
 """
 
 import json
@@ -23,10 +23,13 @@ from clothjax.types import Material
 MODELS = storage.ASSETS / "models"
 WEIGHTS, CONFIG, REPORT = "model.npz", "config.yaml", "report.json"
 STAGES = ("stage1", "stage2", "tuning")
-HESSIAN = "phi/inverse_hessian"
-FORMAT = 4  # of a packed model; before 4 a scale is of a column, 2 has arrays that are no longer used, 1 no number
+HESSIAN, SHAPES = "phi/inverse_hessian", "phi/garment/blendshapes"
+# of a packed model; before 5 the preconditioner is whole, before 4 a scale is of a column, 2 has arrays that are no
+# longer used, 1 no number
+FORMAT = 5
 LARGE = 2000  # entries from which an array is stored in eight bits
 RUN = 32  # consecutive entries that share a scale; a scale for each column would cost the cloth swing
+FINEST = 4e-4  # m, step of a vertex as a blend weight goes through all of its range; in a rollout its spread is 1/40
 
 
 class TrainedPsi(NamedTuple):
@@ -186,9 +189,10 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
     for name, leaf in checkpoint.named(parts).items():
         leaf = np.asarray(leaf)
         if name == HESSIAN:
-            leaf = leaf if isinstance(normalizers, ForceScales) else leaf.astype(np.float16)
+            leaf = np.tril(leaf if isinstance(normalizers, ForceScales) else leaf.astype(np.float16))
         elif leaf.ndim > 1 and leaf.size > LARGE:
-            leaf, arrays[f"{name}|scale"] = _in_eight_bits(leaf)
+            least = _least_steps(phi["params"]["garment"], normalizers) if name == SHAPES else None
+            leaf, arrays[f"{name}|scale"] = _in_eight_bits(leaf, least)
         arrays[name] = leaf
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -204,11 +208,33 @@ def write(out: str | Path, config: Config, phi: dict, predictor: dict, normalize
     return (out / WEIGHTS).stat().st_size
 
 
-def _in_eight_bits(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an array in eight bits, and the scale of each run of entries [N / RUN]."""
+def _in_eight_bits(array: np.ndarray, least: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return an array [K, ...] in eight bits, and the scale of each run of entries [N / RUN].
+
+    Args:
+        least: [K], scales of rows to be at least so; None for as fine as eight bits can be.
+    """
     runs = np.pad(array.reshape(-1), (0, -array.size % RUN)).reshape(-1, RUN)
-    scale = np.maximum(np.abs(runs).max(axis=1) / 127, 1e-20).astype(np.float32)
+    scale = np.maximum(np.abs(runs).max(axis=1) / 127, 1e-20)
+    if least is not None:
+        row = np.minimum(np.arange(len(runs) + 1) * RUN * len(array) // array.size, len(array) - 1)
+        scale = np.maximum(scale, np.minimum(least[row[:-1]], least[row[1:]]))  # a run may be of two rows
+    scale = _rounded_up(scale.astype(np.float32))
     return np.round(runs / scale[:, None]).astype(np.int8).reshape(-1)[: array.size].reshape(array.shape), scale
+
+
+def _rounded_up(scale: np.ndarray) -> np.ndarray:
+    """Return positive scales in the eight bits of precision that deflate well."""
+    return ((scale.view(np.uint32) + 0xFFFF) & 0xFFFF0000).view(np.float32)
+
+
+def _least_steps(garment: dict, normalizers: Normalizers | ForceScales) -> np.ndarray | None:
+    """Return how fine blend shapes are stored at most [K] m, by the ranges of their weights; None where not known."""
+    if "skip" not in garment or not isinstance(normalizers, ForceScales):
+        return None
+    span = np.asarray(normalizers.high) - np.asarray(normalizers.low)
+    ranges = np.sqrt(np.square(np.asarray(garment["skip"])).T @ np.square(span))
+    return FINEST / np.maximum(ranges, 1.0)
 
 
 def _from_eight_bits(array: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -249,6 +275,8 @@ def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
                     leaves[name] = _from_eight_bits(leaf, scale) if number > 3 else np.float32(leaf * scale)
                 else:
                     leaves[name] = leaf.astype(np.float32)
+        if number > 4 and HESSIAN in leaves:
+            leaves[HESSIAN] += np.tril(leaves[HESSIAN], -1).T
         tree = checkpoint.nested(leaves)
         tree["phi"]["garment"]  # all else of a model needs it
         if config.stage2.forces:

@@ -157,8 +157,8 @@ def test_a_packed_model_of_a_newer_format_is_refused(tmp_path, monkeypatch):
     _, _, predictor, normalizers = trained.psi(tmp_path / "skirt")
     trained.write(tmp_path / "again", config, model, predictor, normalizers)
     with np.load(tmp_path / "again" / trained.WEIGHTS) as file:
-        assert file["format"] == trained.FORMAT == 4
+        assert file["format"] == trained.FORMAT == 5
     assert list(checkpoint.named(trained.phi(tmp_path / "again")[1])) == list(checkpoint.named(model))
     monkeypatch.setattr(trained, "FORMAT", 3)
-    with pytest.raises(ValueError, match=r"model\.npz: has format 4, .* reads up to 3; update it"):
+    with pytest.raises(ValueError, match=r"model\.npz: has format 5, .* reads up to 3; update it"):
         trained.phi(tmp_path / "again")
