@@ -1,9 +1,10 @@
 """The measures of a run as one nested dictionary, and as Markdown."""
 
+import json
 import multiprocessing
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,18 +23,20 @@ from clothjax.evaluation.rollouts import (
     skinned_trajectory,
     windows,
 )
-from clothjax.files import storage
+from clothjax.files import configuration, damage, storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
 from clothjax.physics.energies import GRAVITY
-from clothjax.progress import progress_bar
+from clothjax.progress import progress_bar, say
 from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
+from clothjax.training import run_folder
 from clothjax.types import Motion
 
+MEASURED = "measured.json"  # parts of an evaluation that was stopped
 CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, and where the solver is asked
 PUSHES = {  # accelerations beside gravity, m/s^2, and the frames in which they push
     "none": ((0.0, 0.0, 0.0), (0, None)),
@@ -76,15 +79,16 @@ def evaluate(
 ) -> dict:
     """Measure every method of a run: `lbs`, `phi` and `psi`, or `lbs` and a baseline.
 
-    Results are in `evaluation.<method>` (means over motions) and `motions.<name>.<method>`.
+    Results are in `evaluation.<method>` (means over motions) and `motions.<name>.<method>`. Each part is kept as it is
+    measured: an evaluation that was stopped goes on where it was.
 
     Args:
         motions: asset names or paths; default: those of `settings`.
         settings: default: those that the run was trained with.
-        jobs: processes that measure at once, each a motion, the long rollout, the wearers or the pushes.
+        jobs: processes that measure at once, each a motion, the long rollout, a wearer or a push.
 
     Raises:
-        ValueError: if there is no motion to measure on.
+        ValueError: if there is no motion to measure on, or what was kept is not readable.
     """
     measured = Measured.load(run, settings)
     output_folder(run).mkdir(parents=True, exist_ok=True)
@@ -94,20 +98,24 @@ def evaluate(
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
     for name in names:
         assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
-    parts: list[Part] = [(measure_wearers, names[0])] if config.evaluation.wearers else []  # what takes longest first
-    parts += [(measure_pushed, names[0])] if config.stage2.forces else []
-    parts += [(measure_motion, name) for name in names] + [(measure_long, names[0])]
+    wearers = assembly.wearers(measured.experiment) if config.evaluation.wearers else ()
+    pushes = PUSHES if config.stage2.forces else ()
+    in_motion = {name: Part(measure_motion, (name,)) for name in names}
+    over_long = Part(measure_long, (names[0],))
+    worn = {wearer: Part(measure_wearer, (names[0], wearer)) for wearer in wearers}
+    pushed = {push: Part(measure_push, (names[0], push)) for push in pushes}
+    parts = [*in_motion.values(), *worn.values(), over_long, *pushed.values()]  # what takes longest first
     with progress_bar("evaluating", len(parts)) as report:
-        found = dict(zip(parts, _all(measured, parts, settings, jobs, report), strict=True))
-    by_motion = {Path(name).stem: found[measure_motion, name] for name in names}
-    long = found[measure_long, names[0]]
+        found = _all(measured, parts, settings, jobs, report)
+    by_motion = {Path(name).stem: found[part] for name, part in in_motion.items()}
+    long = found[over_long]
     return {
         "evaluation": {
             stage: _mean([one[stage] for one in by_motion.values()]) | long.get(stage, {}) for stage in measured.stages
         },
         "motions": by_motion,
-        "wearers": found.get((measure_wearers, names[0]), {}),
-        "pushed": found.get((measure_pushed, names[0]), {}),
+        "wearers": {wearer: found[part] for wearer, part in worn.items()},
+        "pushed": {push: found[part] for push, part in pushed.items()},
         "betas": assembly.betas(config).tolist(),
         "gap_frames": config.evaluation.gap_frames,
         "garment": config.garment,
@@ -138,28 +146,62 @@ class Measured(NamedTuple):
         return cls(run, experiment, character, _stages(experiment, model, run), shapes)
 
 
-Part = tuple[Callable[[Measured, str], dict], str]
+class Part(NamedTuple):
+    """Part of an evaluation, which a process measures by itself."""
+
+    measure: Callable[..., dict]  # from a Measured and ...
+    about: tuple[str, ...]  # ... a motion, for some of them also a wearer or a push
+
+    @property
+    def name(self) -> str:
+        return ", ".join((self.measure.__name__, *self.about))
 
 
 def _all(
     measured: Measured, parts: list[Part], settings: EvaluationConfig | None, jobs: int, report: Callable[[int], None]
-) -> list[dict]:
-    """Measure all parts in order, or by several processes, which load the run themselves."""
-    results: list[dict] = []
+) -> dict[Part, dict]:
+    """Measure all parts that were not measured before, here or by several processes, which load the run themselves."""
+    path, of = output_folder(measured.run) / MEASURED, _fingerprint(measured)
+    found = _kept(path, of)
+    left = [part for part in parts if part.name not in found]
+    if len(left) < len(parts):
+        say(f"{path}: has {len(parts) - len(left)} of {len(parts)} parts; remove it to measure them again")
 
-    def add(result: dict) -> None:
-        results.append(result)
-        report(len(results))
+    def add(part: Part, result: dict) -> None:
+        found[part.name] = result
+        with run_folder.whole(path) as file:
+            file.write(json.dumps({"of": of, "parts": found}).encode())
+        report(sum(each.name in found for each in parts))
 
     if jobs == 1:
-        for measure, name in parts:
-            add(measure(measured, name))
-        return results
-    spawn = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
-    with ProcessPoolExecutor(min(jobs, len(parts)), spawn, _begin, (measured.run, settings)) as pool:
-        for future in [pool.submit(_work, part) for part in parts]:
-            add(future.result())
-    return results
+        for part in left:
+            add(part, part.measure(measured, *part.about))
+    elif left:
+        spawn = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
+        with ProcessPoolExecutor(min(jobs, len(left)), spawn, _begin, (measured.run, settings)) as pool:
+            working = {pool.submit(_work, part): part for part in left}
+            for future in as_completed(working):
+                add(working[future], future.result())
+    path.unlink(missing_ok=True)
+    return {part: found[part.name] for part in parts}
+
+
+def _fingerprint(measured: Measured) -> int:
+    """Return a number that tells evaluations of other models, or with other settings, apart."""
+    run, experiment, _, stages, _ = measured
+    models = [trained.network(run)[1], *(trained.psi(run)[1:] if "psi" in stages else ())]
+    return run_folder.fingerprint(configuration.to_dict(experiment.config), jax.tree.leaves(models))
+
+
+def _kept(path: Path, of: int) -> dict[str, dict]:
+    """Return what an evaluation of the same `_fingerprint` left when it was stopped, by the names of parts."""
+    if not path.exists():
+        return {}
+    try:
+        kept = json.loads(path.read_text())
+        return kept["parts"] if kept["of"] == of else {}
+    except damage.UNREADABLE as error:
+        raise ValueError(f"{path}: not what an evaluation leaves ({error}); remove it") from error
 
 
 _own: list[Measured] = []  # what a process of `_all` measures
@@ -170,8 +212,7 @@ def _begin(run: Path, settings: EvaluationConfig | None) -> None:
 
 
 def _work(part: Part) -> dict:
-    measure, name = part
-    return measure(_own[0], name)
+    return part.measure(_own[0], *part.about)
 
 
 def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
@@ -265,46 +306,40 @@ def measure(
     return result
 
 
-def measure_wearers(measured: Measured, name: str) -> dict[str, dict]:
-    """Measure the gaps of all methods but skinning on nine characters, over the start of a motion."""
+def measure_wearer(measured: Measured, name: str, wearer: str) -> dict[str, dict]:
+    """Measure the gaps of all methods but skinning on one of nine characters, over the start of a motion."""
     experiment, stages = measured.experiment, measured.stages
     config, clip = experiment.config, assembly.motion(experiment, name)
     clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
     poses = windows(clip)
     sampled = np.linspace(SETTLING_FRAMES, len(clip.translation) - 4, CHARACTERS_GAPS).astype(int)
-    result = {}
-    for name, (betas, material) in assembly.wearers(experiment).items():
-        character = assembly.dress(experiment, betas, material)
-        result[name] = {
-            stage: metrics.gaps(
-                metrics.step_measures(experiment.scene, character, make(character, clip)(), poses, sampled, config)
-            )
-            for stage, make in stages.items()
-            if stage != "lbs"
-        }
-    return result
+    character = assembly.dress(experiment, *assembly.wearers(experiment)[wearer])
+    return {
+        stage: metrics.gaps(
+            metrics.step_measures(experiment.scene, character, make(character, clip)(), poses, sampled, config)
+        )
+        for stage, make in stages.items()
+        if stage != "lbs"
+    }
 
 
-def measure_pushed(measured: Measured, name: str) -> dict[str, dict]:
-    """Measure the gaps of a Psi with forces under accelerations beside gravity, over the start of a motion."""
+def measure_push(measured: Measured, name: str, push: str) -> dict[str, float]:
+    """Measure the gaps of a Psi with forces under an acceleration beside gravity, over the start of a motion."""
     run, experiment, character, *_ = measured
     config, frames, clip = experiment.config, CHARACTERS_FRAMES, assembly.motion(experiment, name)
     clip = Motion(clip.rotations[:frames], clip.translation[:frames], clip.fps)
-    poses = windows(clip)
+    poses, (acceleration, lasting) = windows(clip), PUSHES[push]
     count = poses.translation.shape[0]
     psi = loading.load(run, betas=np.asarray(character.betas), material=character.material)
-    result = {}
-    for name, (acceleration, lasting) in PUSHES.items():
-        external = np.zeros((count, 3), np.float32)
-        external[slice(*lasting)] = acceleration
-        first, last = max(lasting[0] - 1, SETTLING_FRAMES), (lasting[1] or count) - 2  # steps that are pushed
-        sampled = np.linspace(first, last, 2 * CHARACTERS_GAPS).astype(int)
-        track = psi_trajectory(psi, clip, jnp.asarray(external))
-        steps = metrics.step_measures(
-            experiment.scene, character, jnp.asarray(track), poses, sampled, config, external=external
-        )
-        result[name] = metrics.gaps(steps)
-    return result
+    external = np.zeros((count, 3), np.float32)
+    external[slice(*lasting)] = acceleration
+    first, last = max(lasting[0] - 1, SETTLING_FRAMES), (lasting[1] or count) - 2  # steps that are pushed
+    sampled = np.linspace(first, last, 2 * CHARACTERS_GAPS).astype(int)
+    track = psi_trajectory(psi, clip, jnp.asarray(external))
+    steps = metrics.step_measures(
+        experiment.scene, character, jnp.asarray(track), poses, sampled, config, external=external
+    )
+    return metrics.gaps(steps)
 
 
 def measure_long(measured: Measured, name: str) -> dict[str, dict]:

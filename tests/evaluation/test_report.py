@@ -1,12 +1,15 @@
-"""What a report measures beside the validation motions."""
+"""What a report measures beside the validation motions, and how it goes on after a stop."""
+
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from samples import random_force_psi
 
 from clothjax.evaluation import metrics, report
 from clothjax.material import configured_material
-from clothjax.runtime import loading
+from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
 
 
@@ -25,7 +28,8 @@ def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     experiment = forced.experiment
     character = assembly.dress(experiment, jnp.zeros(10), configured_material(experiment.config))
     measured = report.Measured(tmp_path, experiment, character, {}, None)
-    assert set(report.measure_pushed(measured, "walk_3")) == set(report.PUSHES)
+    for push in report.PUSHES:
+        assert report.measure_push(measured, "walk_3", push) == {}
     by_name = dict(zip(report.PUSHES, asked))
     for name, (acceleration, _) in report.PUSHES.items():
         track, frames, external = by_name[name]
@@ -34,3 +38,57 @@ def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     calm, gust = by_name["none"][0], by_name["gust"][0]
     np.testing.assert_allclose(gust[:30], calm[:30], atol=1e-5)
     assert np.abs(gust[30] - calm[30]).max() > 1e-5
+
+
+def test_an_evaluation_that_was_stopped_goes_on_where_it_was(tmp_path, monkeypatch):
+    measured, stops, asked, told = report.Measured(tmp_path, None, None, {}, None), ["c"], [], []
+
+    def measure(_, name, *about):
+        asked.append(name)
+        if name in stops:
+            raise KeyboardInterrupt
+        return {"psi": {"gap": 0.1 * ord(name), "finite": True}}
+
+    monkeypatch.setattr(report, "_fingerprint", lambda _: 7)
+    parts = [report.Part(measure, (name, "thin")) for name in "abcd"]
+
+    def evaluate():
+        asked.clear()
+        told.clear()
+        return report._all(measured, parts, None, 1, told.append)
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate()
+    stops.clear()
+    found = evaluate()
+    assert asked == ["c", "d"] and told == [3, 4] and list(found) == parts
+    assert found == evaluate() and asked == ["a", "b", "c", "d"]  # what has ended leaves nothing
+
+    stops.append("c")
+    with pytest.raises(KeyboardInterrupt):
+        evaluate()
+    monkeypatch.setattr(report, "_fingerprint", lambda _: 8)  # another model
+    stops.clear()
+    assert evaluate() == found and asked == ["a", "b", "c", "d"]
+    (tmp_path / report.MEASURED).write_text('{"of": 8}')
+    with pytest.raises(ValueError, match=r"measured\.json: not what an evaluation leaves .*; remove it"):
+        evaluate()
+
+
+def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatch):
+    forced = random_force_psi()
+    models = {"network": {"w": np.ones(3)}, "predictor": {"v": np.ones(2)}}
+    monkeypatch.setattr(trained, "network", lambda _: (None, models["network"]))
+    monkeypatch.setattr(trained, "psi", lambda _: trained.TrainedPsi(None, {}, models["predictor"], ()))
+
+    def number(experiment=forced.experiment):
+        return report._fingerprint(report.Measured(tmp_path, experiment, None, {"psi": None}, None))
+
+    first, config = number(), forced.experiment.config
+    settings = dataclasses.replace(config.evaluation, gap_frames=config.evaluation.gap_frames + 1)
+    other = dataclasses.replace(config, evaluation=settings)
+    assert number() == first != number(forced.experiment._replace(config=other))
+    for part in ("network", "predictor"):
+        before, models[part] = models[part], {"w": np.zeros(3)}
+        assert number() != first
+        models[part] = before
