@@ -90,19 +90,19 @@ def solve_step(
         evaluate = partial(_value_and_gradient, step=step, mesh=mesh, config=config, laws=laws)
         energy, gradient, _ = _host(evaluate(x), free)
         iterations = 0
-        while np.linalg.norm(gradient) > tolerance * weight and iterations < max_iterations:
+        while _norm(gradient) > tolerance * weight and iterations < max_iterations:
             blocks, diagonal = hessians.blocks(x, step, mesh, pattern, config, laws)
             if not (np.isfinite(blocks).all() and np.isfinite(diagonal).all()):
                 break
             # inexact far away, more exact as the gradient falls: the last iterations converge superlinearly
-            forcing = min(0.1, np.sqrt(0.1 * np.linalg.norm(gradient) / weight))
+            forcing = min(0.1, np.sqrt(0.1 * _norm(gradient) / weight))
             direction = _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing)
             iterations += 1
             x, energy, gradient, moved = _line_search(evaluate, x, energy, gradient, direction, free)
             if not moved:
                 break
         stretch, depth = (float(value) for value in _condition(x, step, mesh, free[:, 0]))
-    norm = float(np.linalg.norm(gradient))
+    norm = _norm(gradient)
     return x, SolverInfo(norm <= tolerance * weight, iterations, norm, norm / weight, energy, stretch, depth)
 
 
@@ -165,6 +165,15 @@ def to_float64(leaf: Array | Scalar) -> np.ndarray:
     return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
 
 
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the inner product of two arrays; BLAS would share it out, and wait for cores that others use."""
+    return float(np.sum(a * b))
+
+
+def _norm(a: np.ndarray) -> float:
+    return _dot(a, a) ** 0.5
+
+
 def _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing) -> np.ndarray:
     """Return a descent direction [V, 3] m: the Newton step to a residual `forcing`, or up to negative curvature.
 
@@ -182,11 +191,11 @@ def _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing) -> 
 
     residual = -gradient.reshape(-1)
     solution, search = np.zeros_like(residual), preconditioned(residual)
-    squared = residual @ search
+    squared = _dot(residual, search)
     limit = forcing**2 * squared
     for iteration in range(CG_ITERATIONS):
         product = matrix @ search
-        curvature = search @ product
+        curvature = _dot(search, product)
         if curvature <= 0:
             if iteration == 0:
                 solution = search
@@ -195,7 +204,7 @@ def _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing) -> 
         solution += length * search
         residual -= length * product
         next_search = preconditioned(residual)
-        previous, squared = squared, residual @ next_search
+        previous, squared = squared, _dot(residual, next_search)
         if squared < limit:
             break
         search = next_search + (squared / previous) * search
@@ -204,15 +213,15 @@ def _conjugate_gradients(blocks, diagonal, gradient, free, pattern, forcing) -> 
 
 def _line_search(evaluate, x, energy, gradient, direction, free):
     """Backtrack (Armijo) along a direction from x; the last result is true if a better point was found."""
-    slope = float(np.sum(gradient * direction))
-    squared = float(np.sum(gradient * gradient))
+    slope = _dot(gradient, direction)
+    squared = _dot(gradient, gradient)
     length = 1.0
     while length >= SHORTEST_STEP:
         trial = x + length * direction
         trial_energy, trial_gradient, rounding = _host(evaluate(trial), free)
         lower = trial_energy <= energy + 1e-4 * length * slope
         # near the minimum the decrease drowns in the rounding of the energy, but not that of the gradient
-        level = abs(trial_energy - energy) <= rounding and float(np.sum(trial_gradient * trial_gradient)) < squared
+        level = abs(trial_energy - energy) <= rounding and _dot(trial_gradient, trial_gradient) < squared
         if lower or level:
             return trial, trial_energy, trial_gradient, True
         length *= 0.5
