@@ -22,8 +22,6 @@ demo: $(INSTALLED)  ## a character that you steer, live in the browser
 docs: $(INSTALLED)  ## the reference of the library, made from its docstrings: runs/api/index.html
 	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax $(MODULES)
 
-# they compile more than they compute: 0.5 to 0.8 of the time without LLVM's optimisations and XLA's fusion emitters
-test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 test: $(INSTALLED)  ## the tests of every day
 	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile --max-worker-restart 0
 

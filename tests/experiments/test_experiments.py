@@ -144,7 +144,8 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
     for (name, one), other in zip(
         checkpoint.named(model).items(), checkpoint.named(model_packed).values(), strict=True
     ):
-        assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
+        step = trained.FINEST if name == "params/garment/blendshapes" else 0.0  # at most, of weights that go nowhere
+        assert np.abs(one - other).max() <= max(np.abs(one).max() / 250, 0.51 * step), name
     experiment = assembly.assemble(config)
     clip = assembly.motion(experiment, "walk_3")
     one, other = (rollouts.psi_trajectory(loading.load(which), clip)[:20] for which in (finished, "toy"))
@@ -240,7 +241,8 @@ def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))
     assert config.motions == ("dance_3",) and config.tuning.steps == 40 and before.tuning.steps == 20
     for (name, one), other in zip(checkpoint.named(phi).items(), checkpoint.named(phi_after).values(), strict=True):
-        assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
+        step = trained.FINEST if name == "params/garment/blendshapes" else 0.0  # at most, of weights that go nowhere
+        assert np.abs(one - other).max() <= max(np.abs(one).max() / 250, 0.51 * step), name
     one, other = (trained.psi(tmp_path / name) for name in ("packed", "out"))
     assert max(np.abs(a - b).max() for a, b in zip(jax.tree.leaves(one[2]), jax.tree.leaves(other[2]))) > 1e-3
     assert (other[3].pose.low <= one[3].pose.low).all() and (other[3].pose.high >= one[3].pose.high).all()
