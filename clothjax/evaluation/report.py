@@ -2,6 +2,8 @@
 
 import json
 import multiprocessing
+import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -67,7 +69,9 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, 
             present = [motion for motion in wanted if storage.asset(motion).is_file()]
             absent = set(wanted) - set(present)
             print(f"{name}: on {', '.join(present)}", *(f"({motion} is not here)" for motion in absent))
-        reports[name] = evaluate(folder, present, jobs=jobs)
+        reports[name] = _evaluated(folder, present, jobs=jobs)
+    for folder in folders.values():  # not before all of them are measured
+        _forget(folder)
     first, *others = (report["evaluation"] for report in reports.values())
     stages = [stage for stage in first if all(stage in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
@@ -90,6 +94,15 @@ def evaluate(
     Raises:
         ValueError: if there is no motion to measure on, or what was kept is not readable.
     """
+    report = _evaluated(run, motions, settings, jobs)
+    _forget(run)
+    return report
+
+
+def _evaluated(
+    run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None, jobs: int = 1
+) -> dict:
+    """Do what `evaluate` does, and keep the parts."""
     measured = Measured.load(run, settings)
     output_folder(run).mkdir(parents=True, exist_ok=True)
     config = measured.experiment.config
@@ -161,7 +174,7 @@ def _all(
     measured: Measured, parts: list[Part], settings: EvaluationConfig | None, jobs: int, report: Callable[[int], None]
 ) -> dict[Part, dict]:
     """Measure all parts that were not measured before, here or by several processes, which load the run themselves."""
-    path, of = output_folder(measured.run) / MEASURED, _fingerprint(measured)
+    path, of = _parts_file(measured.run), _fingerprint(measured)
     found = _kept(path, of)
     left = [part for part in parts if part.name not in found]
     if len(left) < len(parts):
@@ -180,10 +193,22 @@ def _all(
         spawn = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
         with ProcessPoolExecutor(min(jobs, len(left)), spawn, _begin, (measured.run, settings)) as pool:
             working = {pool.submit(_work, part): part for part in left}
-            for future in as_completed(working):
-                add(working[future], future.result())
-    path.unlink(missing_ok=True)
+            try:
+                for future in as_completed(working):
+                    add(working[future], future.result())
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # else what is left is measured, and lost
+                raise
     return {part: found[part.name] for part in parts}
+
+
+def _parts_file(run: Path) -> Path:
+    return output_folder(run) / MEASURED
+
+
+def _forget(run: Path) -> None:
+    """Remove the parts that an evaluation kept, which is over: the next one measures anew."""
+    _parts_file(run).unlink(missing_ok=True)
 
 
 def _fingerprint(measured: Measured) -> int:
@@ -199,7 +224,7 @@ def _kept(path: Path, of: int) -> dict[str, dict]:
         return {}
     try:
         kept = json.loads(path.read_text())
-        return kept["parts"] if kept["of"] == of else {}
+        return dict(kept["parts"]) if kept["of"] == of else {}
     except damage.UNREADABLE as error:
         raise ValueError(f"{path}: not what an evaluation leaves ({error}); remove it") from error
 
@@ -208,7 +233,14 @@ _own: list[Measured] = []  # what a process of `_all` measures
 
 
 def _begin(run: Path, settings: EvaluationConfig | None) -> None:
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     _own.append(Measured.load(run, settings))
+
+
+def _end_with(parent) -> None:
+    """End this process when the one that began it is gone, however it ended."""
+    parent.join()
+    os._exit(1)
 
 
 def _work(part: Part) -> dict:

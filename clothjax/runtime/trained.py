@@ -29,7 +29,7 @@ HESSIAN, SHAPES = "phi/inverse_hessian", "phi/garment/blendshapes"
 FORMAT = 5
 LARGE = 2000  # entries from which an array is stored in eight bits
 RUN = 32  # consecutive entries that share a scale; a scale for each column would cost the cloth swing
-FINEST = 9e-4  # m, step of a vertex as a blend weight goes through all of its range; in a rollout its spread is 1/20
+FINEST = 9e-4  # m, step of a vertex as a blend weight goes through all of its range, 20 times its rms in labels
 
 
 class TrainedPsi(NamedTuple):

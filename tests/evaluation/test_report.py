@@ -57,12 +57,17 @@ def test_an_evaluation_that_was_stopped_goes_on_where_it_was(tmp_path, monkeypat
         told.clear()
         return report._all(measured, parts, None, 1, told.append)
 
+    def whole():
+        found = evaluate()
+        report._forget(tmp_path)
+        return found
+
     with pytest.raises(KeyboardInterrupt):
         evaluate()
     stops.clear()
-    found = evaluate()
+    found = whole()
     assert asked == ["c", "d"] and told == [3, 4] and list(found) == parts
-    assert found == evaluate() and asked == ["a", "b", "c", "d"]  # what has ended leaves nothing
+    assert found == whole() and asked == ["a", "b", "c", "d"]  # what has ended leaves nothing
 
     stops.append("c")
     with pytest.raises(KeyboardInterrupt):
@@ -70,9 +75,10 @@ def test_an_evaluation_that_was_stopped_goes_on_where_it_was(tmp_path, monkeypat
     monkeypatch.setattr(report, "_fingerprint", lambda _: 8)  # another model
     stops.clear()
     assert evaluate() == found and asked == ["a", "b", "c", "d"]
-    (tmp_path / report.MEASURED).write_text('{"of": 8}')
-    with pytest.raises(ValueError, match=r"measured\.json: not what an evaluation leaves .*; remove it"):
-        evaluate()
+    for damaged in ('{"of": 8}', '{"of": 8, "parts": 3}', "{"):
+        (tmp_path / report.MEASURED).write_text(damaged)
+        with pytest.raises(ValueError, match=r"measured\.json: not what an evaluation leaves .*; remove it"):
+            evaluate()
 
 
 def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatch):

@@ -241,8 +241,7 @@ def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
     (before, phi), (config, phi_after) = (trained.phi(tmp_path / name) for name in ("packed", "out"))
     assert config.motions == ("dance_3",) and config.tuning.steps == 40 and before.tuning.steps == 20
     for (name, one), other in zip(checkpoint.named(phi).items(), checkpoint.named(phi_after).values(), strict=True):
-        step = trained.FINEST if name == "params/garment/blendshapes" else 0.0  # at most, of weights that go nowhere
-        assert np.abs(one - other).max() <= max(np.abs(one).max() / 250, 0.51 * step), name
+        assert np.abs(one - other).max() <= np.abs(one).max() / 250, name
     one, other = (trained.psi(tmp_path / name) for name in ("packed", "out"))
     assert max(np.abs(a - b).max() for a, b in zip(jax.tree.leaves(one[2]), jax.tree.leaves(other[2]))) > 1e-3
     assert (other[3].pose.low <= one[3].pose.low).all() and (other[3].pose.high >= one[3].pose.high).all()
@@ -259,7 +258,7 @@ def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
 def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solvers(finished):
     config = rollouts.load_run(finished)[0].config
     settings = dataclasses.replace(config.evaluation, frames=14, solver_frames=20, betas=0.25)
-    report = measures.evaluate(finished, ["twist_3"], settings)
+    report = measures.evaluate(finished, ["twist_3"], settings, jobs=2)
     assert report["motions"]["twist_3"]["solver"]["frames"] == 12 and np.abs(report["betas"]).max() <= 0.25
 
 
@@ -273,7 +272,7 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
         stage = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
         return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), stage), "motions": {}}
 
-    monkeypatch.setattr(measures, "evaluate", measured)
+    monkeypatch.setattr(measures, "_evaluated", measured)
     report = measures.evaluate_packed({name: tmp_path / name for name in figures}, jobs=2)
     assert report["mean"]["psi"] == {"energy_gap": 0.2, "penetration_max_mm": 2.0, "finite": False}
     assert report["dress"]["phi"]["energy_gap"] == 0.3 and report["skirt"]["motions"] == {}
