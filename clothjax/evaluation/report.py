@@ -1,12 +1,8 @@
 """The measures of a run as one nested dictionary, and as Markdown."""
 
-import json
-import multiprocessing
-import os
-import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +12,7 @@ import numpy as np
 
 from clothjax.config import EvaluationConfig
 from clothjax.evaluation import metrics, rollouts
+from clothjax.evaluation.parts import Kept, Part, measure_all
 from clothjax.evaluation.rollouts import (
     SETTLING_FRAMES,
     Tracks,
@@ -25,12 +22,12 @@ from clothjax.evaluation.rollouts import (
     skinned_trajectory,
     windows,
 )
-from clothjax.files import configuration, damage, storage
+from clothjax.files import configuration, storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
 from clothjax.physics.energies import GRAVITY
-from clothjax.progress import progress_bar, say
+from clothjax.progress import progress_bar
 from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
@@ -119,7 +116,8 @@ def _evaluated(
     pushed = {push: Part(measure_push, (names[0], push)) for push in pushes}
     parts = [*in_motion.values(), *worn.values(), over_long, *pushed.values()]  # what takes longest first
     with progress_bar("evaluating", len(parts)) as report:
-        found = _all(measured, parts, settings, jobs, report)
+        kept = Kept(_parts_file(run), _fingerprint(measured))
+        found = measure_all(parts, measured, partial(Measured.load, run, settings), kept, jobs, report)
     by_motion = {Path(name).stem: found[part] for name, part in in_motion.items()}
     long = found[over_long]
     return {
@@ -159,49 +157,6 @@ class Measured(NamedTuple):
         return cls(run, experiment, character, _stages(experiment, model, run), shapes)
 
 
-class Part(NamedTuple):
-    """Part of an evaluation, which a process measures by itself."""
-
-    measure: Callable[..., dict]  # from a Measured and ...
-    about: tuple[str, ...]  # ... a motion, for some of them also a wearer or a push
-
-    @property
-    def name(self) -> str:
-        return ", ".join((self.measure.__name__, *self.about))
-
-
-def _all(
-    measured: Measured, parts: list[Part], settings: EvaluationConfig | None, jobs: int, report: Callable[[int], None]
-) -> dict[Part, dict]:
-    """Measure all parts that were not measured before, here or by several processes, which load the run themselves."""
-    path, of = _parts_file(measured.run), _fingerprint(measured)
-    found = _kept(path, of)
-    left = [part for part in parts if part.name not in found]
-    if len(left) < len(parts):
-        say(f"{path}: has {len(parts) - len(left)} of {len(parts)} parts; remove it to measure them again")
-
-    def add(part: Part, result: dict) -> None:
-        found[part.name] = result
-        with run_folder.whole(path) as file:
-            file.write(json.dumps({"of": of, "parts": found}).encode())
-        report(sum(each.name in found for each in parts))
-
-    if jobs == 1:
-        for part in left:
-            add(part, part.measure(measured, *part.about))
-    elif left:
-        spawn = multiprocessing.get_context("spawn")  # a copy of a process with threads may hang
-        with ProcessPoolExecutor(min(jobs, len(left)), spawn, _begin, (measured.run, settings)) as pool:
-            working = {pool.submit(_work, part): part for part in left}
-            try:
-                for future in as_completed(working):
-                    add(working[future], future.result())
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # else what is left is measured, and lost
-                raise
-    return {part: found[part.name] for part in parts}
-
-
 def _parts_file(run: Path) -> Path:
     return output_folder(run) / MEASURED
 
@@ -216,35 +171,6 @@ def _fingerprint(measured: Measured) -> int:
     run, experiment, _, stages, _ = measured
     models = [trained.network(run)[1], *(trained.psi(run)[1:] if "psi" in stages else ())]
     return run_folder.fingerprint(configuration.to_dict(experiment.config), jax.tree.leaves(models))
-
-
-def _kept(path: Path, of: int) -> dict[str, dict]:
-    """Return what an evaluation of the same `_fingerprint` left when it was stopped, by the names of parts."""
-    if not path.exists():
-        return {}
-    try:
-        kept = json.loads(path.read_text())
-        return dict(kept["parts"]) if kept["of"] == of else {}
-    except damage.UNREADABLE as error:
-        raise ValueError(f"{path}: not what an evaluation leaves ({error}); remove it") from error
-
-
-_own: list[Measured] = []  # what a process of `_all` measures
-
-
-def _begin(run: Path, settings: EvaluationConfig | None) -> None:
-    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
-    _own.append(Measured.load(run, settings))
-
-
-def _end_with(parent) -> None:
-    """End this process when the one that began it is gone, however it ended."""
-    parent.join()
-    os._exit(1)
-
-
-def _work(part: Part) -> dict:
-    return part.measure(_own[0], *part.about)
 
 
 def measure_motion(measured: Measured, name: str) -> dict[str, dict]:

@@ -1,10 +1,9 @@
-"""What a report measures beside the validation motions, and how it goes on after a stop."""
+"""What a report measures beside the validation motions, and what tells evaluations apart."""
 
 import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from samples import random_force_psi
 
 from clothjax.evaluation import metrics, report
@@ -40,45 +39,35 @@ def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     assert np.abs(gust[30] - calm[30]).max() > 1e-5
 
 
-def test_an_evaluation_that_was_stopped_goes_on_where_it_was(tmp_path, monkeypatch):
-    measured, stops, asked, told = report.Measured(tmp_path, None, None, {}, None), ["c"], [], []
+def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
+    """A method and the solver are asked of one character in its own cloth; skinning is asked nothing."""
+    experiment = random_force_psi().experiment
+    asked = []
 
-    def measure(_, name, *about):
-        asked.append(name)
-        if name in stops:
-            raise KeyboardInterrupt
-        return {"psi": {"gap": 0.1 * ord(name), "finite": True}}
+    def stage(name):
+        def make(character, clip):
+            asked.append((name, character, clip))
+            return lambda: np.full((len(clip.translation) - 2, 1, 3), len(asked), np.float32)
 
-    monkeypatch.setattr(report, "_fingerprint", lambda _: 7)
-    parts = [report.Part(measure, (name, "thin")) for name in "abcd"]
+        return make
 
-    def evaluate():
+    def step_measures(scene, character, track, poses, frames, config):
+        asked.append(("solver", character, frames))
+        return int(track[0, 0, 0])
+
+    monkeypatch.setattr(metrics, "step_measures", step_measures)
+    monkeypatch.setattr(metrics, "gaps", lambda steps: {"of": steps})
+    stages = {"lbs": stage("lbs"), "phi": stage("phi"), "psi": stage("psi")}
+    measured = report.Measured(tmp_path, experiment, None, stages, None)
+    for wearer, (betas, material) in assembly.wearers(experiment).items():
         asked.clear()
-        told.clear()
-        return report._all(measured, parts, None, 1, told.append)
-
-    def whole():
-        found = evaluate()
-        report._forget(tmp_path)
-        return found
-
-    with pytest.raises(KeyboardInterrupt):
-        evaluate()
-    stops.clear()
-    found = whole()
-    assert asked == ["c", "d"] and told == [3, 4] and list(found) == parts
-    assert found == whole() and asked == ["a", "b", "c", "d"]  # what has ended leaves nothing
-
-    stops.append("c")
-    with pytest.raises(KeyboardInterrupt):
-        evaluate()
-    monkeypatch.setattr(report, "_fingerprint", lambda _: 8)  # another model
-    stops.clear()
-    assert evaluate() == found and asked == ["a", "b", "c", "d"]
-    for damaged in ('{"of": 8}', '{"of": 8, "parts": 3}', "{"):
-        (tmp_path / report.MEASURED).write_text(damaged)
-        with pytest.raises(ValueError, match=r"measured\.json: not what an evaluation leaves .*; remove it"):
-            evaluate()
+        assert report.measure_wearer(measured, "walk_3", wearer) == {"phi": {"of": 1}, "psi": {"of": 3}}
+        assert [name for name, *_ in asked] == ["phi", "solver", "psi", "solver"]
+        for name, character, which in asked:
+            np.testing.assert_array_equal(character.betas, betas)
+            assert character.material == material
+            frames = report.CHARACTERS_FRAMES
+            assert max(which) < frames - 2 if name == "solver" else len(which.translation) == frames
 
 
 def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatch):

@@ -263,11 +263,16 @@ def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solver
 
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):
+    """Parts that were kept are there until all garments are measured: a stop at the last loses none."""
     monkeypatch.setattr(trained, "network", lambda _: (Config(), {}))
     figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
+    kept = [tmp_path / name / measures.MEASURED for name in figures]
+    for path in kept:
+        path.parent.mkdir()
+        path.write_text("{}")
 
     def measured(folder, motions, jobs):
-        assert motions == ["walk_3"] and jobs == 2
+        assert motions == ["walk_3"] and jobs == 2 and all(path.exists() for path in kept)
         gap, most, finite = figures[folder.name]
         stage = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
         return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), stage), "motions": {}}
@@ -276,6 +281,7 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
     report = measures.evaluate_packed({name: tmp_path / name for name in figures}, jobs=2)
     assert report["mean"]["psi"] == {"energy_gap": 0.2, "penetration_max_mm": 2.0, "finite": False}
     assert report["dress"]["phi"]["energy_gap"] == 0.3 and report["skirt"]["motions"] == {}
+    assert not any(path.exists() for path in kept)
 
 
 def test_wearers_are_thin_and_heavy_soft_and_stiff():

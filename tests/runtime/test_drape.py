@@ -601,6 +601,8 @@ def test_a_packed_model_errs_by_half_a_step_of_each_run(packed):
     with np.load(folder / trained.WEIGHTS) as file:
         assert file["phi/garment/blendshapes"].dtype == file["predictor/linear/kernel"].dtype == np.int8
         assert file["phi/inverse_hessian"].dtype == np.float32
+        for name in (name for name in file.files if name.endswith("|scale")):
+            assert not (file[name].view(np.uint32) & 0xFFFF).any(), name  # deflates well
     for expected, leaf in pairs:
         expected, leaf = np.asarray(expected).reshape(-1), np.asarray(leaf).reshape(-1)
         for start in range(0, expected.size, trained.RUN):
