@@ -23,7 +23,7 @@ docs: $(INSTALLED)  ## the reference of the library, made from its docstrings: r
 	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax $(MODULES)
 
 test: $(INSTALLED)  ## the tests of every day
-	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile --max-worker-restart 0
+	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test-slow: $(INSTALLED)  ## the long ones
 	@$(PYTHON) -m pytest -m slow

@@ -19,6 +19,13 @@ import jax
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+LONGEST = ("test_experiments.py",)
+
+
+def pytest_collection_modifyitems(items):
+    """What takes longest begins first: with `--no-loadscope-reorder`, no process waits at the end for the other one."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once(tmp_path_factory, worker_id):

@@ -1,14 +1,15 @@
 // Energies and relaxation of cloth, sums of blend shapes, a sparse solve and searches, as functions that XLA calls: see
 // kernels.py.
 //
-// Energies and relaxation have positions as rows [3][V]. Loops over elements first write the gradients at all corners,
-// [3][k elements + 1]; then loops over vertices add up those of their own corners, which `place` [most][V] names. The
-// last entry of a row is zero: it is named by vertices with fewer corners than others. So none of these loops scatters,
-// and they become vectors.
+// Energies and relaxation compute several garments of a batch at once: each number is a vector with one lane for each
+// garment, `Four` or `Eight`, or a float of one. So a corner is read and its gradient added with no gather and no
+// scatter. Where there are fewer garments than lanes, the last one is computed again.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <initializer_list>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -21,31 +22,79 @@ using Integers = ffi::Buffer<ffi::S32>;
 using Result = ffi::ResultBuffer<ffi::F32>;
 using Indices = ffi::ResultBuffer<ffi::S32>;
 
-constexpr size_t BLOCK = 256;      // elements whose energies are computed before they are added up
+typedef float Four __attribute__((vector_size(4 * sizeof(float))));
+typedef float Eight __attribute__((vector_size(8 * sizeof(float))));
+
+constexpr size_t BLOCK = 256;      // elements whose energies are added up in single precision
 constexpr size_t CHUNK = 1024;     // numbers of a blend shape that stay in the nearest cache
 constexpr size_t TOGETHER = 4;     // blend shapes that are read together
 constexpr size_t COLUMNS = 24;     // right-hand sides that are solved for together
 constexpr float SLIVER = 1e-6f;    // twice the area, over a hinge's squared size, below which a face has no direction
 
-struct Elements {
-  size_t count, vertices, most;
-  const int32_t *corner, *place;  // [k][count], [most][vertices]
+template <typename T>
+constexpr size_t lanes() {
+  return sizeof(T) / sizeof(float);
+}
+
+template <typename T>
+static inline float lane(const T &all, size_t l) {
+  if constexpr (lanes<T>() == 1)
+    return all;
+  else
+    return all[l];
+}
+
+// As many whole numbers.
+template <typename T>
+struct Whole {
+  using type = decltype(T{} > T{});
 };
 
-struct Sheet {
-  Elements faces;
-  const float *inverse, *weight, *mu, *lam;  // [4][count], [count] of the others
+template <>
+struct Whole<float> {
+  using type = int32_t;
 };
 
-struct Hinges {
-  Elements hinges;
-  const float *stiffness, *angle;  // [count]
+template <typename T>
+struct Three {
+  T x, y, z;
 };
 
-// 1 / sqrt(x) of a positive x, by three steps of Newton: sqrtf may set errno, and keeps loops from being vectors.
-static inline float inverse_root(float x) {
-  int32_t bits;
-  float y;
+template <typename T>
+static inline Three<T> operator+(const Three<T> &a, const Three<T> &b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+
+template <typename T>
+static inline Three<T> operator-(const Three<T> &a, const Three<T> &b) {
+  return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+
+template <typename T>
+static inline Three<T> operator*(const T &s, const Three<T> &a) {
+  return {s * a.x, s * a.y, s * a.z};
+}
+
+template <typename T>
+static inline void operator+=(Three<T> &a, const Three<T> &b) {
+  a.x += b.x, a.y += b.y, a.z += b.z;
+}
+
+template <typename T>
+static inline T dot(const Three<T> &a, const Three<T> &b) {
+  return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+template <typename T>
+static inline Three<T> cross(const Three<T> &a, const Three<T> &b) {
+  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+// 1 / sqrt(x) of a positive x, by three steps of Newton.
+template <typename T>
+static inline T inverse_root(T x) {
+  typename Whole<T>::type bits;
+  T y;
   std::memcpy(&bits, &x, sizeof bits);
   bits = 0x5f3759df - (bits >> 1);
   std::memcpy(&y, &bits, sizeof y);
@@ -54,230 +103,261 @@ static inline float inverse_root(float x) {
 }
 
 // The arc tangent of y / x (Abramowitz and Stegun 4.4.49), without a branch.
-static inline float arc(float y, float x) {
-  const float a = std::fabs(x), b = std::fabs(y), more = a > b ? a : b, less = a > b ? b : a;
-  const float q = more > 0.0f ? less / more : 0.0f, t = q * q;
-  float angle = q * (1.0f + t * (-0.3333314528f + t * (0.1999355085f + t * (-0.1420889944f + t * (0.1065626393f +
-                t * (-0.0752896400f + t * (0.0429096138f + t * (-0.0161657367f + t * 0.0028662257f))))))));
+template <typename T>
+static inline T arc(T y, T x) {
+  const T zero = {}, a = x < zero ? -x : x, b = y < zero ? -y : y, more = a > b ? a : b, less = a > b ? b : a;
+  const T q = less / (more > zero ? more : zero + 1.0f), t = q * q;
+  T angle = q * (1.0f + t * (-0.3333314528f + t * (0.1999355085f + t * (-0.1420889944f + t * (0.1065626393f +
+            t * (-0.0752896400f + t * (0.0429096138f + t * (-0.0161657367f + t * 0.0028662257f))))))));
   angle = b > a ? 1.57079633f - angle : angle;
-  angle = x < 0.0f ? 3.14159265f - angle : angle;
-  return y < 0.0f ? -angle : angle;
+  angle = x < zero ? 3.14159265f - angle : angle;
+  return y < zero ? -angle : angle;
 }
 
-// Adds up the gradients at the corners of each vertex, to [3][V].
-static void assemble(const Elements &of, size_t wide, const float *__restrict corners, float *__restrict sum) {
-  const size_t V = of.vertices;
-  for (size_t c = 0; c < 3; c++)
-    for (size_t begin = 0; begin < V; begin += BLOCK) {
-      const size_t end = begin + BLOCK < V ? begin + BLOCK : V;
-      float total[BLOCK] = {0};
-      for (size_t k = 0; k < of.most; k++)
-        for (size_t v = begin; v < end; v++) total[v - begin] += corners[c * wide + of.place[k * V + v]];
-      std::memcpy(sum + c * V + begin, total, (end - begin) * sizeof(float));
+// Rows of numbers of the garments that are computed at once.
+template <typename T>
+struct Rows {
+  const float *of[lanes<T>()];
+
+  T operator[](size_t i) const {
+    if constexpr (lanes<T>() == 1) {
+      return of[0][i];
+    } else {
+      T all;
+      for (size_t l = 0; l < lanes<T>(); l++) all[l] = of[l][i];
+      return all;
     }
+  }
+
+  Three<T> three(size_t i) const { return {(*this)[3 * i], (*this)[3 * i + 1], (*this)[3 * i + 2]}; }
+};
+
+template <typename T>
+using Points = std::vector<Three<T>>;
+
+template <typename T>
+static Points<T> points(const Rows<T> &rows, size_t count) {
+  Points<T> all(count);
+  for (size_t v = 0; v < count; v++) all[v] = rows.three(v);
+  return all;
 }
 
+// Energies of elements, added up in double precision.
+template <typename T>
+struct Sum {
+  double total[lanes<T>()] = {0};
+  T part = {};
+  size_t parts = 0;
+
+  void add(T energy) {
+    part += energy;
+    if (++parts == BLOCK) flush();
+  }
+
+  void flush() {
+    for (size_t l = 0; l < lanes<T>(); l++) total[l] += lane(part, l);
+    part = T{}, parts = 0;
+  }
+};
+
+// Which vertices are the k corners of elements, [count][k].
+template <size_t k>
+struct Elements {
+  size_t count;
+  const int32_t *corner;
+
+  size_t at(size_t c, size_t i) const { return (size_t)corner[k * i + c]; }
+};
+
+// A face: the inverse of its shape at rest ((a, b), (c, d)), 1/m, and how it resists, J.
+template <typename T>
+struct Face {
+  T a, b, c, d, mu, lam;
+};
+
+// The deformation gradient of a face, or its change; or its first Piola-Kirchhoff stress, or that one's change.
+template <typename T>
 struct Columns {
-  float ux, uy, uz, vx, vy, vz;
+  Three<T> u, v;
 };
 
-// The deformation gradient of a face, or its change where x, y and z move.
-static inline Columns deformed(const float *x, const float *y, const float *z, int32_t p, int32_t q, int32_t r, float a,
-                               float b, float c, float d) {
-  const float lx = x[p] - x[r], ly = y[p] - y[r], lz = z[p] - z[r];
-  const float mx = x[q] - x[r], my = y[q] - y[r], mz = z[q] - z[r];
-  return {a * lx + c * mx, a * ly + c * my, a * lz + c * mz, b * lx + d * mx, b * ly + d * my, b * lz + d * mz};
+template <typename T>
+static inline Columns<T> deformed(const Face<T> &f, const Three<T> &p, const Three<T> &q, const Three<T> &r) {
+  const Three<T> l = p - r, m = q - r;
+  return {f.a * l + f.c * m, f.b * l + f.d * m};
 }
 
-// The gradient of a face at its corners: (p, q) is the first Piola-Kirchhoff stress, or its change.
-static inline void to_corners(float *corners, size_t n, float a, float b, float c, float d, Columns stress) {
-  const size_t wide = 3 * n + 1;
-  const auto [px, py, pz, qx, qy, qz] = stress;
-  const float gx = a * px + b * qx, gy = a * py + b * qy, gz = a * pz + b * qz;
-  const float hx = c * px + d * qx, hy = c * py + d * qy, hz = c * pz + d * qz;
-  corners[0] = gx, corners[n] = hx, corners[2 * n] = -gx - hx;
-  corners[wide] = gy, corners[wide + n] = hy, corners[wide + 2 * n] = -gy - hy;
-  corners[2 * wide] = gz, corners[2 * wide + n] = hz, corners[2 * wide + 2 * n] = -gz - hz;
+// The second Piola-Kirchhoff stress ((s, t), (t, u)) of Saint Venant and Kirchhoff, or its change, by Green's strain.
+template <typename T>
+struct Stress {
+  T s, t, u;
+};
+
+template <typename T>
+static inline Stress<T> stress(const Face<T> &f, T along, T shear, T across) {
+  const T all = f.lam * (along + across), twice = 2.0f * f.mu;
+  return {twice * along + all, twice * shear, twice * across + all};
 }
 
-// Saint Venant-Kirchhoff: its energy, and its gradient [3][V]; `corners` is room for 3 (3 faces + 1) numbers.
-static double stretching(const Sheet &s, const float *__restrict x, float *__restrict corners, float *gradient) {
-  const size_t n = s.faces.count, V = s.faces.vertices, wide = 3 * n + 1;
-  const float *y = x + V, *z = y + V, *inverse = s.inverse, *weights = s.weight, *mus = s.mu, *lams = s.lam;
-  const int32_t *first = s.faces.corner, *second = first + n, *third = second + n;
-  double energy = 0.0;
-  for (size_t begin = 0; begin < n; begin += BLOCK) {
-    const size_t end = begin + BLOCK < n ? begin + BLOCK : n;
-    float parts[BLOCK] = {0};
-#pragma GCC ivdep
-    for (size_t i = begin; i < end; i++) {
-      const int32_t p = first[i], q = second[i], r = third[i];
-      const float a = inverse[i], b = inverse[n + i], c = inverse[2 * n + i], d = inverse[3 * n + i];
-      const auto [ux, uy, uz, vx, vy, vz] = deformed(x, y, z, p, q, r, a, b, c, d);
-      const float along = 0.5f * (ux * ux + uy * uy + uz * uz - 1.0f), shear = 0.5f * (ux * vx + uy * vy + uz * vz);
-      const float across = 0.5f * (vx * vx + vy * vy + vz * vz - 1.0f), trace = along + across;
-      const float mu = mus[i], lam = lams[i], w = weights[i];
-      parts[i - begin] =
-          w * (mu * (along * along + 2.0f * shear * shear + across * across) + 0.5f * lam * trace * trace);
-      const float s0 = w * (2.0f * mu * along + lam * trace), s1 = w * 2.0f * mu * shear;
-      const float s2 = w * (2.0f * mu * across + lam * trace);
-      const float px = s0 * ux + s1 * vx, py = s0 * uy + s1 * vy, pz = s0 * uz + s1 * vz;
-      const float qx = s1 * ux + s2 * vx, qy = s1 * uy + s2 * vy, qz = s1 * uz + s2 * vz;
-      to_corners(corners + i, n, a, b, c, d, {px, py, pz, qx, qy, qz});
-    }
-    for (float part : parts) energy += part;
+template <typename T>
+static inline Columns<T> times(const Columns<T> &by, const Stress<T> &of) {
+  return {of.s * by.u + of.t * by.v, of.t * by.u + of.u * by.v};
+}
+
+// Adds the gradient of a face to that of its corners.
+template <typename T>
+static inline void to_corners(const Face<T> &f, const Columns<T> &of, Three<T> &p, Three<T> &q, Three<T> &r) {
+  const Three<T> g = f.a * of.u + f.b * of.v, h = f.c * of.u + f.d * of.v;
+  p += g, q += h, r = r - (g + h);
+}
+
+// Saint Venant-Kirchhoff: adds the energies of faces to `sum`, and their gradients to those of the vertices.
+template <typename T, typename Faces>
+static inline void stretching(const Elements<3> &corners, const Faces &faces, const Points<T> &x, Points<T> &gradient,
+                              Sum<T> &sum) {
+  for (size_t i = 0; i < corners.count; i++) {
+    const size_t p = corners.at(0, i), q = corners.at(1, i), r = corners.at(2, i);
+    const Face<T> f = faces[i];
+    const Columns<T> F = deformed(f, x[p], x[q], x[r]);
+    const T along = 0.5f * (dot(F.u, F.u) - 1.0f), shear = 0.5f * dot(F.u, F.v), across = 0.5f * (dot(F.v, F.v) - 1.0f);
+    const T trace = along + across;
+    sum.add(f.mu * (along * along + 2.0f * shear * shear + across * across) + 0.5f * f.lam * trace * trace);
+    to_corners(f, times(F, stress(f, along, shear, across)), gradient[p], gradient[q], gradient[r]);
   }
-  for (size_t c = 0; c < 3; c++) corners[c * wide + 3 * n] = 0.0f;
-  assemble(s.faces, wide, corners, gradient);
-  return energy;
 }
 
-// The Hessian of the stretching energy times a move [3][V] of the vertices (energies.stretching_hessian_product).
-static void stretching_along(const Sheet &s, const float *__restrict x, const float *__restrict move,
-                             float *__restrict corners, float *product) {
-  const size_t n = s.faces.count, V = s.faces.vertices, wide = 3 * n + 1;
-  const float *y = x + V, *z = y + V, *e = move, *f = e + V, *g = f + V;
-  const float *inverse = s.inverse, *weights = s.weight, *mus = s.mu, *lams = s.lam;
-  const int32_t *first = s.faces.corner, *second = first + n, *third = second + n;
-#pragma GCC ivdep
-  for (size_t i = 0; i < n; i++) {
-    const int32_t p = first[i], q = second[i], r = third[i];
-    const float a = inverse[i], b = inverse[n + i], c = inverse[2 * n + i], d = inverse[3 * n + i];
-    const auto [ux, uy, uz, vx, vy, vz] = deformed(x, y, z, p, q, r, a, b, c, d);
-    const auto [dux, duy, duz, dvx, dvy, dvz] = deformed(e, f, g, p, q, r, a, b, c, d);
-    const float along = 0.5f * (ux * ux + uy * uy + uz * uz - 1.0f), shear = 0.5f * (ux * vx + uy * vy + uz * vz);
-    const float across = 0.5f * (vx * vx + vy * vy + vz * vz - 1.0f);
-    const float d0 = ux * dux + uy * duy + uz * duz, d2 = vx * dvx + vy * dvy + vz * dvz;
-    const float d1 = 0.5f * (ux * dvx + uy * dvy + uz * dvz + vx * dux + vy * duy + vz * duz);
-    const float mu = 2.0f * mus[i], lam = lams[i], w = weights[i];
-    const float s0 = w * (mu * along + lam * (along + across)), s1 = w * mu * shear;
-    const float s2 = w * (mu * across + lam * (along + across));
-    const float t0 = w * (mu * d0 + lam * (d0 + d2)), t1 = w * mu * d1, t2 = w * (mu * d2 + lam * (d0 + d2));
-    const float px = s0 * dux + s1 * dvx + t0 * ux + t1 * vx, qx = s1 * dux + s2 * dvx + t1 * ux + t2 * vx;
-    const float py = s0 * duy + s1 * dvy + t0 * uy + t1 * vy, qy = s1 * duy + s2 * dvy + t1 * uy + t2 * vy;
-    const float pz = s0 * duz + s1 * dvz + t0 * uz + t1 * vz, qz = s1 * duz + s2 * dvz + t1 * uz + t2 * vz;
-    to_corners(corners + i, n, a, b, c, d, {px, py, pz, qx, qy, qz});
+// Adds the Hessian of the stretching energy times a move of the vertices (energies.stretching_hessian_product).
+template <typename T>
+static void stretching_along(const Elements<3> &corners, const std::vector<Face<T>> &faces, const Points<T> &x,
+                             const Points<T> &move, Points<T> &product) {
+  for (size_t i = 0; i < corners.count; i++) {
+    const size_t p = corners.at(0, i), q = corners.at(1, i), r = corners.at(2, i);
+    const Face<T> &f = faces[i];
+    const Columns<T> F = deformed(f, x[p], x[q], x[r]), d = deformed(f, move[p], move[q], move[r]);
+    const T along = 0.5f * (dot(F.u, F.u) - 1.0f), shear = 0.5f * dot(F.u, F.v), across = 0.5f * (dot(F.v, F.v) - 1.0f);
+    const T sheared = 0.5f * (dot(F.u, d.v) + dot(F.v, d.u));
+    const Columns<T> held = times(d, stress(f, along, shear, across));
+    const Columns<T> turned = times(F, stress(f, dot(F.u, d.u), sheared, dot(F.v, d.v)));
+    to_corners(f, {held.u + turned.u, held.v + turned.v}, product[p], product[q], product[r]);
   }
-  for (size_t c = 0; c < 3; c++) corners[c * wide + 3 * n] = 0.0f;
-  assemble(s.faces, wide, corners, product);
 }
 
-// The dihedral energy (energies.bending), with k / (8 A) as stiffness; `corners` is room for 3 (4 hinges + 1) numbers.
-static double bending(const Hinges &h, const float *__restrict x, float *__restrict corners, float *gradient) {
-  const size_t n = h.hinges.count, V = h.hinges.vertices, wide = 4 * n + 1;
-  const float *y = x + V, *z = y + V, *stiffness = h.stiffness, *rest = h.angle;
-  const int32_t *start = h.hinges.corner, *stop = start + n, *left = stop + n, *right = left + n;
-  double energy = 0.0;
-  for (size_t begin = 0; begin < n; begin += BLOCK) {
-    const size_t end = begin + BLOCK < n ? begin + BLOCK : n;
-    float parts[BLOCK] = {0};
-#pragma GCC ivdep
-    for (size_t i = begin; i < end; i++) {
-      const int32_t p = start[i], q = stop[i], r = left[i], t = right[i];
-      const float ex = x[q] - x[p], ey = y[q] - y[p], ez = z[q] - z[p];
-      const float lx = x[r] - x[p], ly = y[r] - y[p], lz = z[r] - z[p];
-      const float rx = x[t] - x[p], ry = y[t] - y[p], rz = z[t] - z[p];
-      const float nx = ey * lz - ez * ly, ny = ez * lx - ex * lz, nz = ex * ly - ey * lx;
-      const float ox = ry * ez - rz * ey, oy = rz * ex - rx * ez, oz = rx * ey - ry * ex;
-      const float sine = (ny * oz - nz * oy) * ex + (nz * ox - nx * oz) * ey + (nx * oy - ny * ox) * ez;
-      const float cosine = nx * ox + ny * oy + nz * oz, edge = ex * ex + ey * ey + ez * ez;
-      const float ll = lx * lx + ly * ly + lz * lz, rr = rx * rx + ry * ry + rz * rz;
-      const float longest = edge > ll ? edge : ll, size = longest > rr ? longest : rr;
-      float ee = edge, nn = nx * nx + ny * ny + nz * nz, oo = ox * ox + oy * oy + oz * oz;
-      const float bent = (nn < oo ? nn : oo) > SLIVER * SLIVER * size * size ? 1.0f : 0.0f;
-      ee += 1.0f - bent, nn += 1.0f - bent, oo += 1.0f - bent;  // where it is flat they are nearly zero
-      const float length = ee * inverse_root(ee), angle = bent * arc(sine, cosine * length) - rest[i];
-      const float w = 2.0f * stiffness[i], torque = bent * w * ee * angle * length, longer = w * angle * angle;
-      parts[i - begin] = stiffness[i] * edge * angle * angle;
-      const float u = -torque / nn, v = -torque / oo;
-      const float a = u * (lx * ex + ly * ey + lz * ez) / ee, b = v * (rx * ex + ry * ey + rz * ez) / ee;
-      const float sx = a * nx + b * ox - longer * ex, sy = a * ny + b * oy - longer * ey;
-      const float sz = a * nz + b * oz - longer * ez;
-      float *gx = corners + i, *gy = gx + wide, *gz = gy + wide;
-      gx[0] = sx - u * nx - v * ox, gx[n] = -sx, gx[2 * n] = u * nx, gx[3 * n] = v * ox;
-      gy[0] = sy - u * ny - v * oy, gy[n] = -sy, gy[2 * n] = u * ny, gy[3 * n] = v * oy;
-      gz[0] = sz - u * nz - v * oz, gz[n] = -sz, gz[2 * n] = u * nz, gz[3 * n] = v * oz;
-    }
-    for (float part : parts) energy += part;
+// The dihedral energy (energies.bending), of stiffnesses k / (8 A).
+template <typename T>
+static void bending(const Elements<4> &hinges, const Rows<T> &stiffnesses, const Rows<T> &rest, const Points<T> &x,
+                    Points<T> &gradient, Sum<T> &sum) {
+  const T zero = {}, one = zero + 1.0f;
+  for (size_t i = 0; i < hinges.count; i++) {
+    const size_t p = hinges.at(0, i), q = hinges.at(1, i), r = hinges.at(2, i), t = hinges.at(3, i);
+    const T stiffness = stiffnesses[i];
+    const Three<T> e = x[q] - x[p], left = x[r] - x[p], right = x[t] - x[p];
+    const Three<T> n = cross(e, left), o = cross(right, e);
+    const T sine = dot(cross(n, o), e), cosine = dot(n, o), edge = dot(e, e), ll = dot(left, left);
+    const T rr = dot(right, right), longest = edge > ll ? edge : ll, size = longest > rr ? longest : rr;
+    T ee = edge, nn = dot(n, n), oo = dot(o, o);
+    const T bent = (nn < oo ? nn : oo) > SLIVER * SLIVER * size * size ? one : zero;
+    ee += 1.0f - bent, nn += 1.0f - bent, oo += 1.0f - bent;  // where it is flat they are nearly zero
+    const T length = ee * inverse_root(ee), angle = bent * arc(sine, cosine * length) - rest[i];
+    const T w = 2.0f * stiffness, torque = bent * w * ee * angle * length, longer = w * angle * angle;
+    sum.add(stiffness * edge * angle * angle);
+    const T u = -torque / nn, v = -torque / oo, a = u * dot(left, e) / ee, b = v * dot(right, e) / ee;
+    const Three<T> s = a * n + b * o - longer * e, to_left = u * n, to_right = v * o;
+    gradient[p] += s - to_left - to_right, gradient[q] = gradient[q] - s;
+    gradient[r] += to_left, gradient[t] += to_right;
   }
-  for (size_t c = 0; c < 3; c++) corners[c * wide + 4 * n] = 0.0f;
-  assemble(h.hinges, wide, corners, gradient);
-  return energy;
 }
 
-// The energy of edges in the body (incremental_potential.edge_collision), of planes [3][count] at places between the
-// ends.
-static double edge_collision(const Elements &edges, const float *__restrict place, const float *__restrict point,
-                             const float *__restrict normal, float stiffness, float offset, const float *__restrict x,
-                             float *__restrict corners, float *gradient) {
-  const size_t n = edges.count, V = edges.vertices, wide = 2 * n + 1;
-  const float *y = x + V, *z = y + V;
-  const int32_t *start = edges.corner, *stop = start + n;
-  double energy = 0.0;
-  for (size_t begin = 0; begin < n; begin += BLOCK) {
-    const size_t end = begin + BLOCK < n ? begin + BLOCK : n;
-    float parts[BLOCK] = {0};
-#pragma GCC ivdep
-    for (size_t i = begin; i < end; i++) {
-      const int32_t p = start[i], q = stop[i];
-      const float t = place[i], nx = normal[i], ny = normal[n + i], nz = normal[2 * n + i];
-      const float dx = x[p] - point[i] + t * (x[q] - x[p]), dy = y[p] - point[n + i] + t * (y[q] - y[p]);
-      const float dz = z[p] - point[2 * n + i] + t * (z[q] - z[p]);
-      const float inside = offset - (dx * nx + dy * ny + dz * nz), depth = inside > 0.0f ? inside : 0.0f;
-      parts[i - begin] = stiffness * depth * depth * depth;
-      const float force = -3.0f * stiffness * depth * depth, gx = force * nx, gy = force * ny, gz = force * nz;
-      corners[i] = (1.0f - t) * gx, corners[n + i] = t * gx;
-      corners[wide + i] = (1.0f - t) * gy, corners[wide + n + i] = t * gy;
-      corners[2 * wide + i] = (1.0f - t) * gz, corners[2 * wide + n + i] = t * gz;
-    }
-    for (float part : parts) energy += part;
+// The energy of edges in the body (incremental_potential.edge_collision), of planes at places between the ends.
+template <typename T>
+static void edge_collision(const Elements<2> &edges, const Rows<T> &places, const Rows<T> &planes, const Rows<T> &normals,
+                           float stiffness, float offset, const Points<T> &x, Points<T> &gradient, Sum<T> &sum) {
+  const T zero = {};
+  for (size_t i = 0; i < edges.count; i++) {
+    const size_t p = edges.at(0, i), q = edges.at(1, i);
+    const T place = places[i];
+    const Three<T> normal = normals.three(i), from = x[p] - planes.three(i) + place * (x[q] - x[p]);
+    const T inside = offset - dot(from, normal), depth = inside > zero ? inside : zero;
+    sum.add(stiffness * depth * depth * depth);
+    const Three<T> force = (-3.0f * stiffness * depth * depth) * normal;
+    gradient[p] += (1.0f - place) * force, gradient[q] += place * force;
   }
-  for (size_t c = 0; c < 3; c++) corners[c * wide + 2 * n] = 0.0f;
-  assemble(edges, wide, corners, gradient);
-  return energy;
 }
 
-// Of a step of relaxation.relaxed.
+// What relaxation.relaxed reads: it moves a vertex by m / sqrt(1 + |m|^2 / longest^2), with the move m = -(1 + momentum)
+// mobility gradient.
+template <typename T>
 struct Relaxing {
-  const float *mobility;
+  Elements<3> corners;
+  std::vector<Face<T>> faces;
+  Rows<T> mobility;
   float momentum, longest;
+
+  T factor(size_t v) const { return -(1.0f + momentum) * mobility[v]; }
+  T share(const Three<T> &m) const { return inverse_root(1.0f + dot(m, m) * (1.0f / (longest * longest))); }
 };
 
-// The move m = -(1 + momentum) mobility gradient, of which m / sqrt(1 + |m|^2 / longest^2) is taken.
-static void relax(const Sheet &s, const Relaxing &by, const float *__restrict x, float *corners, float *__restrict g,
-                  float *__restrict next) {
-  const size_t V = s.faces.vertices;
-  const float square = 1.0f / (by.longest * by.longest), further = -(1.0f + by.momentum);
-  stretching(s, x, corners, g);
-  for (size_t v = 0; v < V; v++) {
-    const float m = further * by.mobility[v], a = m * g[v], b = m * g[V + v], c = m * g[2 * V + v];
-    const float share = inverse_root(1.0f + (a * a + b * b + c * c) * square);
-    next[v] = x[v] + share * a, next[V + v] = x[V + v] + share * b, next[2 * V + v] = x[2 * V + v] + share * c;
+// A step from x, which a step from `before` led to: the gradient at x, and the next positions.
+template <typename T>
+static void relax(const Relaxing<T> &by, const Points<T> &before, const Points<T> &x, Points<T> &gradient,
+                  Points<T> &next) {
+  Sum<T> unused;
+  const T momentum = T{} + by.momentum;
+  std::fill(gradient.begin(), gradient.end(), Three<T>{});
+  stretching(by.corners, by.faces, x, gradient, unused);
+  for (size_t v = 0; v < x.size(); v++) {
+    const Three<T> m = by.factor(v) * gradient[v];
+    next[v] = x[v] + by.share(m) * m + momentum * (x[v] - before[v]);
   }
 }
 
-// Its transpose at x: adds H M by to `to`, with the derivative M of the move by the gradient; both are symmetric.
-static void relax_back(const Sheet &s, const Relaxing &of, const float *__restrict x, float *corners,
-                       float *__restrict g, float *__restrict pushed, const float *__restrict by,
-                       float *__restrict to) {
-  const size_t V = s.faces.vertices;
-  const float square = 1.0f / (of.longest * of.longest), further = -(1.0f + of.momentum);
-  stretching(s, x, corners, g);
-  for (size_t v = 0; v < V; v++) {
-    const float m = further * of.mobility[v], a = m * g[v], b = m * g[V + v], c = m * g[2 * V + v];
-    const float share = inverse_root(1.0f + (a * a + b * b + c * c) * square);
-    const float along = (a * by[v] + b * by[V + v] + c * by[2 * V + v]) * square * share * share;
-    pushed[v] = m * share * (by[v] - along * a), pushed[V + v] = m * share * (by[V + v] - along * b);
-    pushed[2 * V + v] = m * share * (by[2 * V + v] - along * c);
+// The derivative M of the move by the gradient, which is symmetric, times `by`.
+template <typename T>
+static void moved(const Relaxing<T> &of, const Points<T> &gradient, const Points<T> &by, Points<T> &pushed) {
+  const float square = 1.0f / (of.longest * of.longest);
+  for (size_t v = 0; v < by.size(); v++) {
+    const T factor = of.factor(v);
+    const Three<T> m = factor * gradient[v];
+    const T share = of.share(m), along = dot(m, by[v]) * square * share * share;
+    pushed[v] = (factor * share) * (by[v] - along * m);
   }
-  stretching_along(s, x, pushed, corners, g);
-  for (size_t v = 0; v < 3 * V; v++) to[v] += g[v];
+}
+
+// Calls a function for several garments of a batch at once: it is given numbers with lanes, and the first garment.
+template <typename Work>
+static void in_lanes(size_t count, Work work) {
+  for (size_t first = 0; first < count;)
+    if (count - first > lanes<Four>())
+      work(Eight{}, first), first += lanes<Eight>();
+    else if (count - first > 1)
+      work(Four{}, first), first += lanes<Four>();
+    else
+      work(0.0f, first), first += 1;
 }
 
 // The garments of a batch that one jax.vmap made. An operand that they share has an axis of 1, or none.
 template <typename Buffer>
 static auto row(const Buffer &of, size_t length, size_t index) {
   return of.typed_data() + (of.element_count() == length ? 0 : index * length);
+}
+
+// The rows of the garments from `first` on; past the last of them, the last again.
+template <typename T>
+static Rows<T> rows(const Floats &of, size_t length, size_t first, size_t count) {
+  Rows<T> all;
+  for (size_t l = 0; l < lanes<T>(); l++) all.of[l] = row(of, length, std::min(first + l, count - 1));
+  return all;
+}
+
+// Writes the garments from `first` on.
+template <typename T>
+static void write(const Points<T> &from, size_t first, size_t count, float *to) {
+  const size_t V = from.size(), there = std::min(lanes<T>(), count - first);
+  for (size_t l = 0; l < there; l++) {
+    float *own = to + 3 * V * (first + l);
+    for (size_t v = 0; v < V; v++) {
+      own[3 * v] = lane(from[v].x, l), own[3 * v + 1] = lane(from[v].y, l), own[3 * v + 2] = lane(from[v].z, l);
+    }
+  }
 }
 
 template <typename Buffer = Floats>
@@ -299,101 +379,133 @@ static size_t from_last(const Buffer &of, size_t back) {
 // Whether all of a batch share a table.
 static bool shared(const Integers &table) { return table.element_count() == from_last(table, 0) * from_last(table, 1); }
 
-static Elements elements(const Integers &corner, const Integers &place) {
-  return {from_last(corner, 0), from_last(place, 0), from_last(place, 1), corner.typed_data(), place.typed_data()};
+template <size_t k>
+static Elements<k> elements(const Integers &corner) {
+  return {from_last(corner, 1), corner.typed_data()};
 }
 
-static Sheet sheet(const Elements &of, const Floats &inverse, const Floats &weight, const Floats &mu, const Floats &lam,
-                   size_t b) {
-  const size_t n = of.count;
-  return {of, row(inverse, 4 * n, b), row(weight, n, b), row(mu, n, b), row(lam, n, b)};
-}
+// The faces of several garments, which are read as they are used.
+template <typename T>
+struct Sheet {
+  Rows<T> inverse, mu, lam;
 
-static ffi::Error Stretching(Floats x, Integers corner, Integers place, Floats inverse, Floats weight, Floats mu,
-                             Floats lam, Result energy, Result gradient) {
-  const Elements faces = elements(corner, place);
-  const size_t size = 3 * faces.vertices, n = faces.count, count = energy->element_count();
-  if (!fit(count, {{&x, size}, {&inverse, 4 * n}, {&weight, n}, {&mu, n}, {&lam, n}})) return unfit();
-  std::vector<float> corners(3 * (3 * n + 1));
-  for (size_t b = 0; b < count; b++)
-    energy->typed_data()[b] =
-        (float)stretching(sheet(faces, inverse, weight, mu, lam, b), row(x, size, b), corners.data(),
-                          gradient->typed_data() + size * b);
-  return ffi::Error::Success();
-}
-
-static ffi::Error Bending(Floats x, Integers corner, Integers place, Floats stiffness, Floats angle, Result energy,
-                          Result gradient) {
-  const Elements hinges = elements(corner, place);
-  const size_t size = 3 * hinges.vertices, n = hinges.count, count = energy->element_count();
-  if (!fit(count, {{&x, size}, {&stiffness, n}, {&angle, n}})) return unfit();
-  std::vector<float> corners(3 * (4 * n + 1));
-  for (size_t b = 0; b < count; b++)
-    energy->typed_data()[b] = (float)bending({hinges, row(stiffness, n, b), row(angle, n, b)}, row(x, size, b),
-                                             corners.data(), gradient->typed_data() + size * b);
-  return ffi::Error::Success();
-}
-
-static ffi::Error EdgeCollision(Floats x, Integers corner, Integers place, Floats share, Floats point, Floats normal,
-                                float stiffness, float offset, Result energy, Result gradient) {
-  const Elements edges = elements(corner, place);
-  const size_t size = 3 * edges.vertices, n = edges.count, count = energy->element_count();
-  if (!fit(count, {{&x, size}, {&share, n}, {&point, 3 * n}, {&normal, 3 * n}})) return unfit();
-  std::vector<float> corners(3 * (2 * n + 1));
-  for (size_t b = 0; b < count; b++)
-    energy->typed_data()[b] = (float)edge_collision(
-        edges, row(share, n, b), row(point, 3 * n, b), row(normal, 3 * n, b), stiffness, offset, row(x, size, b),
-        corners.data(), gradient->typed_data() + size * b);
-  return ffi::Error::Success();
-}
-
-static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Integers place, Floats inverse, Floats weight,
-                        Floats mu, Floats lam, int32_t steps, float momentum, float longest, Result after) {
-  const Elements faces = elements(corner, place);
-  const size_t V = faces.vertices, n = faces.count, count = after->element_count() / (3 * V * steps);
-  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&weight, n}, {&mu, n}, {&lam, n}})) return unfit();
-  std::vector<float> corners(3 * (3 * n + 1)), g(3 * V);
-  for (size_t b = 0; b < count; b++) {
-    const Sheet s = sheet(faces, inverse, weight, mu, lam, b);
-    const Relaxing by = {row(mobility, V, b), momentum, longest};
-    const float *from = row(x, 3 * V, b), *before = from;
-    for (int32_t i = 0; i < steps; i++) {
-      float *to = after->typed_data() + 3 * V * (steps * b + i);
-      relax(s, by, from, corners.data(), g.data(), to);
-      for (size_t v = 0; v < 3 * V; v++) to[v] += momentum * (from[v] - before[v]);
-      before = from, from = to;
-    }
+  Face<T> operator[](size_t i) const {
+    return {inverse[4 * i], inverse[4 * i + 1], inverse[4 * i + 2], inverse[4 * i + 3], mu[i], lam[i]};
   }
+};
+
+template <typename T>
+static Sheet<T> sheet(size_t n, const Floats &inverse, const Floats &mu, const Floats &lam, size_t first,
+                      size_t count) {
+  return {rows<T>(inverse, 4 * n, first, count), rows<T>(mu, n, first, count), rows<T>(lam, n, first, count)};
+}
+
+// Computes energies of a batch, and their gradients: `add` is given the first garment of several, their positions,
+// their gradients, and a sum of energies.
+template <typename Add>
+static ffi::Error energies(const Floats &x, Result energy, Result gradient, Add add) {
+  const size_t V = from_last(x, 1), count = energy->element_count();
+  if (!fit(count, {{&x, 3 * V}})) return unfit();
+  in_lanes(count, [&](auto numbers, size_t first) {
+    using T = decltype(numbers);
+    const Points<T> at = points(rows<T>(x, 3 * V, first, count), V);
+    Points<T> by(V);
+    Sum<T> sum;
+    add(first, at, by, sum);
+    sum.flush();
+    for (size_t l = 0; l < lanes<T>() && first + l < count; l++) energy->typed_data()[first + l] = (float)sum.total[l];
+    write(by, first, count, gradient->typed_data());
+  });
   return ffi::Error::Success();
 }
 
-static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats after, Floats mobility, Integers corner, Integers place,
-                            Floats inverse, Floats weight, Floats mu, Floats lam, int32_t steps, float momentum,
-                            float longest, Result by) {
-  const Elements faces = elements(corner, place);
-  const size_t V = faces.vertices, n = faces.count, count = by->element_count() / (3 * V);
-  if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&after, 3 * V * steps}, {&mobility, V}, {&inverse, 4 * n},
-                   {&weight, n}, {&mu, n}, {&lam, n}}))
+static ffi::Error Stretching(Floats x, Integers corner, Floats inverse, Floats mu, Floats lam, Result energy,
+                             Result gradient) {
+  const Elements<3> corners = elements<3>(corner);
+  const size_t n = corners.count, count = energy->element_count();
+  if (!fit(count, {{&inverse, 4 * n}, {&mu, n}, {&lam, n}})) return unfit();
+  return energies(x, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+    stretching(corners, sheet<std::decay_t<decltype(sum.part)>>(n, inverse, mu, lam, first, count), at, by, sum);
+  });
+}
+
+static ffi::Error Bending(Floats x, Integers corner, Floats stiffness, Floats angle, Result energy, Result gradient) {
+  const Elements<4> hinges = elements<4>(corner);
+  const size_t n = hinges.count, count = energy->element_count();
+  if (!fit(count, {{&stiffness, n}, {&angle, n}})) return unfit();
+  return energies(x, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+    using T = std::decay_t<decltype(sum.part)>;
+    bending(hinges, rows<T>(stiffness, n, first, count), rows<T>(angle, n, first, count), at, by, sum);
+  });
+}
+
+static ffi::Error EdgeCollision(Floats x, Integers corner, Floats place, Floats point, Floats normal, float stiffness,
+                                float offset, Result energy, Result gradient) {
+  const Elements<2> edges = elements<2>(corner);
+  const size_t n = edges.count, count = energy->element_count();
+  if (!fit(count, {{&place, n}, {&point, 3 * n}, {&normal, 3 * n}})) return unfit();
+  return energies(x, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+    using T = std::decay_t<decltype(sum.part)>;
+    edge_collision(edges, rows<T>(place, n, first, count), rows<T>(point, 3 * n, first, count),
+                   rows<T>(normal, 3 * n, first, count), stiffness, offset, at, by, sum);
+  });
+}
+
+template <typename T>
+static Relaxing<T> relaxing(const Floats &mobility, const Integers &corner, const Floats &inverse, const Floats &mu,
+                            const Floats &lam, float momentum, float longest, size_t V, size_t first, size_t count) {
+  const Elements<3> corners = elements<3>(corner);
+  const Sheet<T> faces = sheet<T>(corners.count, inverse, mu, lam, first, count);
+  std::vector<Face<T>> all(corners.count);
+  for (size_t i = 0; i < corners.count; i++) all[i] = faces[i];
+  return {corners, std::move(all), rows<T>(mobility, V, first, count), momentum, longest};
+}
+
+static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Floats inverse, Floats mu, Floats lam,
+                        int32_t steps, float momentum, float longest, Result after) {
+  const size_t V = from_last(x, 1), n = from_last(corner, 1), count = after->element_count() / (3 * V);
+  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}})) return unfit();
+  in_lanes(count, [&](auto numbers, size_t first) {
+    using T = decltype(numbers);
+    const Relaxing<T> by =
+        relaxing<T>(mobility, corner, inverse, mu, lam, momentum, longest, V, first, count);
+    Points<T> at = points(rows<T>(x, 3 * V, first, count), V), before = at, next(V), gradient(V);
+    for (int32_t i = 0; i < steps; i++) {
+      relax(by, before, at, gradient, next);
+      before.swap(at), at.swap(next);
+    }
+    write(at, first, count, after->typed_data());
+  });
+  return ffi::Error::Success();
+}
+
+static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats mobility, Integers corner, Floats inverse, Floats mu,
+                            Floats lam, int32_t steps, float momentum, float longest, Result by) {
+  const size_t V = from_last(x, 1), n = from_last(corner, 1), count = by->element_count() / (3 * V);
+  if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}))
     return unfit();
-  std::vector<float> corners(3 * (3 * n + 1)), g(3 * V), pushed(3 * V), later(3 * V), held(3 * V);
-  for (size_t b = 0; b < count; b++) {
-    const Sheet s = sheet(faces, inverse, weight, mu, lam, b);
-    const float *passed = row(after, 3 * V * steps, b);
-    const Relaxing of = {row(mobility, V, b), momentum, longest};
-    float *to = by->typed_data() + 3 * V * b;
-    std::memcpy(to, row(cotangent, 3 * V, b), 3 * V * sizeof(float));
-    held.assign(3 * V, 0.0f);
+  in_lanes(count, [&](auto numbers, size_t first) {
+    using T = decltype(numbers);
+    const Relaxing<T> of =
+        relaxing<T>(mobility, corner, inverse, mu, lam, momentum, longest, V, first, count);
+    std::vector<Points<T>> at(steps + 1, Points<T>(V)), gradient(steps, Points<T>(V));
+    at[0] = points(rows<T>(x, 3 * V, first, count), V);
+    for (int32_t i = 0; i < steps; i++) relax(of, at[i ? i - 1 : 0], at[i], gradient[i], at[i + 1]);
+    Points<T> to = points(rows<T>(cotangent, 3 * V, first, count), V), pushed(V), later, held(V);
+    const T further = T{} + momentum;
     for (int32_t i = steps - 1; i >= 0; i--) {
       // `to` is by the positions after step i; those before it also took part in step i + 1, by `held`
-      const float *at = i ? passed + 3 * V * (i - 1) : row(x, 3 * V, b);
-      std::memcpy(later.data(), to, 3 * V * sizeof(float));
-      relax_back(s, of, at, corners.data(), g.data(), pushed.data(), later.data(), to);
-      for (size_t v = 0; v < 3 * V; v++) {
-        to[v] += held[v] + (i ? momentum * later[v] : 0.0f);  // the first step has none before it
-        held[v] = -momentum * later[v];
+      later = to;
+      moved(of, gradient[i], later, pushed);
+      stretching_along(of.corners, of.faces, at[i], pushed, to);
+      for (size_t v = 0; v < V; v++) {
+        to[v] += held[v];
+        if (i) to[v] += further * later[v];  // the first step has none before it
+        held[v] = -further * later[v];
       }
     }
-  }
+    write(to, first, count, by->typed_data());
+  });
   return ffi::Error::Success();
 }
 
@@ -542,21 +654,18 @@ static ffi::Error NearestFaceAround(Floats x, Floats body, Integers faces, Integ
 
 // clang-format off
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothStretching, Stretching, ffi::Ffi::Bind()
-    .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
-    .Ret<Floats>().Ret<Floats>());
+    .Arg<Floats>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Ret<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothBending, Bending, ffi::Ffi::Bind()
-    .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>().Ret<Floats>());
+    .Arg<Floats>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothEdgeCollision, EdgeCollision, ffi::Ffi::Bind()
-    .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
+    .Arg<Floats>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
     .Attr<float>("stiffness").Attr<float>("offset").Ret<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelax, Relax, ffi::Ffi::Bind()
-    .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
-    .Arg<Floats>().Attr<int32_t>("steps").Attr<float>("momentum")
-    .Attr<float>("longest").Ret<Floats>());
+    .Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
+    .Attr<int32_t>("steps").Attr<float>("momentum").Attr<float>("longest").Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothRelaxBack, RelaxBack, ffi::Ffi::Bind()
-    .Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Floats>()
-    .Arg<Floats>().Arg<Floats>().Arg<Floats>().Attr<int32_t>("steps").Attr<float>("momentum")
-    .Attr<float>("longest").Ret<Floats>());
+    .Arg<Floats>().Arg<Floats>().Arg<Floats>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Arg<Floats>()
+    .Attr<int32_t>("steps").Attr<float>("momentum").Attr<float>("longest").Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothSolve, Solve, ffi::Ffi::Bind()
     .Arg<Floats>().Arg<Integers>().Arg<Integers>().Arg<Integers>().Arg<Floats>().Arg<Floats>().Ret<Floats>());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(ClothNearestFace, NearestFace, ffi::Ffi::Bind()

@@ -71,32 +71,23 @@ def used(read: Array, mesh: Iterable[Array] = ()) -> bool:
     return _used.get() and known and read.dtype == jnp.float32
 
 
-class Elements(NamedTuple):
-    """Elements with k corners."""
-
-    corner: np.ndarray  # [k, n] int32, vertices
-    place: np.ndarray  # [most, V] int32: where the corners of each vertex are among all, [k n]; k n for none
-
-
 class Sheet(NamedTuple):
     """Faces that stretch."""
 
-    inverse: Array  # [4, F] 1/m
-    weight: Array  # [F] m^3, area times thickness
-    mu: Array  # [F] Pa
-    lam: Array  # [F] Pa
+    inverse: Array  # [F, 4] 1/m
+    mu: Array  # [F] J, times area and thickness ...
+    lam: Array  # [F] J, ... likewise
 
 
 def stretching(position: Float[Array, "V 3"], rest: Rest, material: Material, mesh: Mesh) -> Float[Array, ""]:
     """Return the sum of `energies.stretching` at positions [V, 3] m, in J."""
-    faces = elements(mesh.faces, len(position))
-    return _energy(position, (*faces, *_sheet(rest, material)), "ClothStretching")
+    return _energy(position, (mesh.faces, *_sheet(rest, material)), "ClothStretching")
 
 
 def bending(position: Float[Array, "V 3"], rest: Rest, material: Material, mesh: Mesh) -> Float[Array, ""]:
     """Return the sum of `energies.bending` at positions [V, 3] m, in J."""
     stiffness = material.bending / (8.0 * rest.hinge_area)
-    operands = (*elements(mesh.hinges, len(position)), stiffness, rest.hinge_angle)
+    operands = (mesh.hinges, stiffness, rest.hinge_angle)
     return _energy(position, operands, "ClothBending")
 
 
@@ -109,25 +100,14 @@ def edge_collision(
         stiffness: J/m^3.
         offset: m.
     """
-    operands = (*elements(mesh.edges, len(position)), contact.place, contact.point_next.T, contact.normal_next.T)
+    operands = (mesh.edges, contact.place, contact.point_next, contact.normal_next)
     settings = (("stiffness", np.float32(stiffness)), ("offset", np.float32(offset)))
     return _energy(position, operands, "ClothEdgeCollision", settings)
 
 
-def elements(corners: Array, vertices: int) -> Elements:
-    """Return elements [n, k] of a mesh as the kernels read them."""
-    corner = np.ascontiguousarray(np.asarray(corners, np.int32).T)
-    order = np.argsort(corner.reshape(-1), kind="stable")
-    vertex = corner.reshape(-1)[order]
-    place = np.full((np.bincount(vertex).max(initial=0), vertices), corner.size, np.int32)
-    place[np.arange(len(vertex)) - np.searchsorted(vertex, vertex), vertex] = order
-    return Elements(corner, place)
-
-
 def _sheet(rest: Rest, material: Material) -> Sheet:
-    inverse, weight = rest.inverse.reshape(-1, 4).T, rest.face_area * np.float32(THICKNESS)
-    mu, lam = (jnp.broadcast_to(jnp.asarray(x, weight.dtype), weight.shape) for x in (material.mu, material.lam))
-    return Sheet(inverse, weight, mu, lam)
+    volume = rest.face_area * np.float32(THICKNESS)
+    return Sheet(rest.inverse.reshape(-1, 4), material.mu * volume, material.lam * volume)
 
 
 Settings = tuple[tuple[str, np.generic], ...]  # of a kernel, by name
@@ -145,7 +125,7 @@ def _energy(position: Array, operands: tuple, name: str, settings: Settings = ()
 
 
 def _energy_and_gradient(position: Array, operands: tuple, name: str, settings: Settings) -> Sequence[Array]:
-    return _call(name, [(), position.shape[::-1]], position.T, *operands, **dict(settings))
+    return _call(name, [(), position.shape], position, *operands, **dict(settings))
 
 
 def _energy_forward(position, operands, name: str, settings: Settings) -> tuple[Array, Array]:
@@ -154,7 +134,7 @@ def _energy_forward(position, operands, name: str, settings: Settings) -> tuple[
 
 
 def _energy_backward(_name: str, _settings: Settings, gradient: Array, cotangent: Array) -> tuple[Array, None]:
-    return cotangent * gradient.T, None
+    return cotangent * gradient, None
 
 
 _energy.defvjp(_energy_forward, _energy_backward, symbolic_zeros=True)
@@ -182,33 +162,23 @@ def relaxed(
     Args:
         longest: m, that the gradient moves a vertex by in a step at most.
     """
-    faces = elements(mesh.faces, len(position))
     settings = (("steps", np.int32(steps)), ("momentum", np.float32(momentum)), ("longest", np.float32(longest)))
-    return _relaxed(position, (mobility, *faces, *_sheet(rest, material)), settings)
+    return _relaxed(position, (mobility, mesh.faces, *_sheet(rest, material)), settings)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _relaxed(position: Array, operands: tuple, settings: Settings) -> Array:
-    return _relaxed_in_turn(position, operands, settings)[-1].T
-
-
-def _relaxed_in_turn(position: Array, operands: tuple, settings: Settings) -> Array:
-    """Return the positions after each step, [steps, 3, V]."""
-    shape = int(dict(settings)["steps"]), *position.shape[::-1]
-    return _call("ClothRelax", [shape], position.T, *operands, **dict(settings))[0]
+    return _call("ClothRelax", [position.shape], position, *operands, **dict(settings))[0]
 
 
 def _relaxed_forward(position, operands, settings: Settings) -> tuple[Array, tuple]:
     position, operands = position.value, _constant(operands)
-    after = _relaxed_in_turn(position, operands, settings)
-    return after[-1].T, (position, after, operands)
+    return _relaxed(position, operands, settings), (position, operands)
 
 
 def _relaxed_backward(settings: Settings, passed: tuple, cotangent: Array) -> tuple[Array, None]:
-    position, after, operands = passed
-    given = (cotangent.T, position.T, after, *operands)
-    (by,) = _call("ClothRelaxBack", [position.shape[::-1]], *given, **dict(settings))
-    return by.T, None
+    position, operands = passed
+    return _call("ClothRelaxBack", [position.shape], cotangent, position, *operands, **dict(settings))[0], None
 
 
 _relaxed.defvjp(_relaxed_forward, _relaxed_backward, symbolic_zeros=True)
