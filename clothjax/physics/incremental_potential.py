@@ -135,7 +135,7 @@ def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: Phys
     A time step of the cloth minimises it.
     """
     terms = energies(new, step, mesh, config)
-    if kernels.used(new, mesh):
+    if kernels.used(new):
         terms |= {name: energy for name, energy in _in_kernels(new, step, mesh, config).items() if name in terms}
     return sum(terms.values())  # pyright: ignore[reportReturnType]  # there are terms
 

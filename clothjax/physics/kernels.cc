@@ -403,9 +403,9 @@ static Sheet<T> sheet(size_t n, const Floats &inverse, const Floats &mu, const F
 // Computes energies of a batch, and their gradients: `add` is given the first garment of several, their positions,
 // their gradients, and a sum of energies.
 template <typename Add>
-static ffi::Error energies(const Floats &x, Result energy, Result gradient, Add add) {
+static ffi::Error energies(const Floats &x, const Integers &corner, Result energy, Result gradient, Add add) {
   const size_t V = from_last(x, 1), count = energy->element_count();
-  if (!fit(count, {{&x, 3 * V}})) return unfit();
+  if (!fit(count, {{&x, 3 * V}}) || !shared(corner)) return unfit();
   in_lanes(count, [&](auto numbers, size_t first) {
     using T = decltype(numbers);
     const Points<T> at = points(rows<T>(x, 3 * V, first, count), V);
@@ -424,7 +424,7 @@ static ffi::Error Stretching(Floats x, Integers corner, Floats inverse, Floats m
   const Elements<3> corners = elements<3>(corner);
   const size_t n = corners.count, count = energy->element_count();
   if (!fit(count, {{&inverse, 4 * n}, {&mu, n}, {&lam, n}})) return unfit();
-  return energies(x, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+  return energies(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
     stretching(corners, sheet<std::decay_t<decltype(sum.part)>>(n, inverse, mu, lam, first, count), at, by, sum);
   });
 }
@@ -433,7 +433,7 @@ static ffi::Error Bending(Floats x, Integers corner, Floats stiffness, Floats an
   const Elements<4> hinges = elements<4>(corner);
   const size_t n = hinges.count, count = energy->element_count();
   if (!fit(count, {{&stiffness, n}, {&angle, n}})) return unfit();
-  return energies(x, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+  return energies(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
     using T = std::decay_t<decltype(sum.part)>;
     bending(hinges, rows<T>(stiffness, n, first, count), rows<T>(angle, n, first, count), at, by, sum);
   });
@@ -444,7 +444,7 @@ static ffi::Error EdgeCollision(Floats x, Integers corner, Floats place, Floats 
   const Elements<2> edges = elements<2>(corner);
   const size_t n = edges.count, count = energy->element_count();
   if (!fit(count, {{&place, n}, {&point, 3 * n}, {&normal, 3 * n}})) return unfit();
-  return energies(x, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+  return energies(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
     using T = std::decay_t<decltype(sum.part)>;
     edge_collision(edges, rows<T>(place, n, first, count), rows<T>(point, 3 * n, first, count),
                    rows<T>(normal, 3 * n, first, count), stiffness, offset, at, by, sum);
@@ -464,7 +464,8 @@ static Relaxing<T> relaxing(const Floats &mobility, const Integers &corner, cons
 static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Floats inverse, Floats mu, Floats lam,
                         int32_t steps, float momentum, float longest, Result after) {
   const size_t V = from_last(x, 1), n = from_last(corner, 1), count = after->element_count() / (3 * V);
-  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}})) return unfit();
+  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}) || !shared(corner))
+    return unfit();
   in_lanes(count, [&](auto numbers, size_t first) {
     using T = decltype(numbers);
     const Relaxing<T> by =
@@ -482,7 +483,8 @@ static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Floats inver
 static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats mobility, Integers corner, Floats inverse, Floats mu,
                             Floats lam, int32_t steps, float momentum, float longest, Result by) {
   const size_t V = from_last(x, 1), n = from_last(corner, 1), count = by->element_count() / (3 * V);
-  if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}))
+  if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}) ||
+      !shared(corner))
     return unfit();
   in_lanes(count, [&](auto numbers, size_t first) {
     using T = decltype(numbers);

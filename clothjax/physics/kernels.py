@@ -6,14 +6,13 @@ are in single precision. They have derivatives by positions and blend weights al
 
 import contextvars
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from clothjax import progress
@@ -65,10 +64,9 @@ def _compiled() -> bool:
     return True
 
 
-def used(read: Array, mesh: Iterable[Array] = ()) -> bool:
-    """Return whether kernels compute what is traced now: what is read has single precision, and the mesh is known."""
-    known = not any(isinstance(corners, Tracer) for corners in mesh)
-    return _used.get() and known and read.dtype == jnp.float32
+def used(read: Array) -> bool:
+    """Return whether kernels compute what is traced now; what is read must have single precision."""
+    return _used.get() and read.dtype == jnp.float32
 
 
 class Sheet(NamedTuple):

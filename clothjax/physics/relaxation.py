@@ -90,7 +90,7 @@ def relaxed(
         mobility: [V] m/N, of `mobility`; a step is longer than that by `momentum`.
         momentum: share of the last step that each goes on with. Its limit of stability rises as its length does.
     """
-    if steps > 0 and kernels.used(position, mesh):
+    if steps > 0 and kernels.used(position):
         return kernels.relaxed(position, mobility, rest, material, mesh, steps, momentum, LONGEST)
     elastic, before = Elastic(rest.inverse, rest.face_area, material.mu, material.lam), position
     for _ in range(steps):
