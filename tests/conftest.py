@@ -23,7 +23,7 @@ LONGEST = ("test_experiments.py",)
 
 
 def pytest_collection_modifyitems(items):
-    """What takes longest begins first: with `--no-loadscope-reorder`, no process waits at the end for the other one."""
+    """What takes longest begins first, with `--no-loadscope-reorder`: at the end no process waits long for another."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
 
 

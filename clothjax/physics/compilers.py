@@ -3,10 +3,13 @@
 Libraries are kept in `clothjax` in the user's folder for caches: that of `XDG_CACHE_HOME`, or `~/.cache`.
 """
 
+import contextlib
 import ctypes
 import hashlib
 import os
+import platform
 import shutil
+import stat
 import subprocess
 import tempfile
 import threading
@@ -14,6 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
+import jaxlib.version
+
+from clothjax import progress
 
 PROGRAMS = {"C": ("cc", "gcc", "clang"), "C++": ("c++", "g++", "clang++")}
 FLAGS = ("-O3", "-march=native")
@@ -56,33 +62,61 @@ def register(source: Path, names: tuple[str, ...], plain: Path | None = None) ->
     with _one_at_a_time:
         if _registered.issuperset(names):
             return
-        handlers = ctypes.CDLL(str(_library(source, plain)))
+        handlers = _load(source, plain)
         for name in names:
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(handlers, name)), platform="cpu")
         _registered.update(names)
 
 
-def _library(source: Path, plain: Path | None) -> Path:
-    """Return the library of a source: the one that was kept, if nothing that it is made of has changed since."""
-    machine = run("C++", [*FLAGS, "-dM", "-E", "-x", "c++", os.devnull])  # compiler and processor define these
-    files = sorted(path for path in source.parent.iterdir() if path.suffix in (".c", ".cc", ".h"))
-    made_of = [machine, *FLAGS, jax.__version__, *(path.read_text() for path in files)]
-    key = hashlib.sha256("\0".join(made_of).encode()).hexdigest()[:16]
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clothjax"
-    library = folder / f"{source.stem}-{key}.so"
-    if library.is_file():
-        return library
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError:  # it cannot be kept
-        folder = Path(tempfile.mkdtemp())
-    with tempfile.TemporaryDirectory(dir=folder) as unfinished:
-        built, objects = Path(unfinished) / library.name, []
+def _load(source: Path, plain: Path | None) -> ctypes.CDLL:
+    """Load the library of a source: one that was kept, or else one that is built now."""
+    kept = _place(source, plain)
+    if kept is not None and all(map(_own, (kept, kept.parent))):
+        try:
+            return ctypes.CDLL(str(kept))
+        except OSError:  # not whole, or not to be loaded from there
+            pass
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        library, objects = Path(folder) / f"lib{source.stem}.so", []
         if plain is not None:
-            objects = [Path(unfinished) / f"{plain.stem}.o"]
+            objects = [Path(folder) / f"{plain.stem}.o"]
             run("C", [*FLAGS, "-fPIC", "-c", plain, "-o", *objects])
         include = f"-isystem{jax.ffi.include_dir()}"
-        run("C++", ["-std=c++17", *FLAGS, "-fPIC", "-shared", include, source, *objects, "-o", built])
-        os.replace(built, folder / library.name)
-    return folder / library.name
+        run("C++", ["-std=c++17", *FLAGS, "-fPIC", "-shared", include, source, *objects, "-o", library])
+        if kept is not None:
+            _keep(library, kept)
+        return ctypes.CDLL(str(library))  # it stays loaded when its file is gone
+
+
+def _place(source: Path, plain: Path | None) -> Path | None:
+    """Return where a library is kept: another place for another source, compiler, machine or version of XLA."""
+    languages = ("C++",) if plain is None else ("C++", "C")
+    machine = [run(each, [*FLAGS, "-dM", "-E", "-x", each.lower(), os.devnull]) for each in languages]
+    files = sorted(path for folder in {source.parent, Path(__file__).parent} for path in folder.iterdir())
+    read = [path.read_bytes() for path in files if path.suffix in (".c", ".cc", ".h") or path == Path(__file__)]
+    named = "\n".join([*machine, *FLAGS, *platform.libc_ver(), jaxlib.version.__version__])
+    key = hashlib.sha256(b"\0".join([named.encode(), *read])).hexdigest()[:16]
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    return folder / "clothjax" / f"{source.stem}-{key}.so" if folder.is_absolute() else None
+
+
+def _own(path: Path) -> bool:
+    """Return whether a path is there, and nobody else can write to it."""
+    try:
+        found = path.stat()
+    except OSError:
+        return False
+    mine = os.name == "posix" and found.st_uid == os.geteuid()
+    return mine and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+def _keep(library: Path, place: Path) -> None:
+    partial = place.with_name(f".{os.getpid()}.{place.name}")
+    try:
+        place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        shutil.copyfile(library, partial)
+        os.replace(partial, place)
+    except OSError as error:
+        progress.say(f"{place}: not kept, and so built in each process ({error.strerror})")
+        with contextlib.suppress(OSError):
+            partial.unlink()

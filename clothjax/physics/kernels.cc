@@ -25,7 +25,7 @@ using Indices = ffi::ResultBuffer<ffi::S32>;
 typedef float Four __attribute__((vector_size(4 * sizeof(float))));
 typedef float Eight __attribute__((vector_size(8 * sizeof(float))));
 
-constexpr size_t BLOCK = 256;      // elements whose energies are added up in single precision
+constexpr size_t BLOCK = 16;       // elements whose energies are added up in single precision
 constexpr size_t CHUNK = 1024;     // numbers of a blend shape that stay in the nearest cache
 constexpr size_t TOGETHER = 4;     // blend shapes that are read together
 constexpr size_t COLUMNS = 24;     // right-hand sides that are solved for together
@@ -142,7 +142,7 @@ static Points<T> points(const Rows<T> &rows, size_t count) {
   return all;
 }
 
-// Energies of elements, added up in double precision.
+// Energies of elements: sums of blocks, added up in double precision.
 template <typename T>
 struct Sum {
   double total[lanes<T>()] = {0};
@@ -384,6 +384,14 @@ static Elements<k> elements(const Integers &corner) {
   return {from_last(corner, 1), corner.typed_data()};
 }
 
+// Whether these are elements [n][k], the same for all of a batch, of vertices that there are.
+template <size_t k>
+static bool among(size_t vertices, const Integers &corner) {
+  if (!shared(corner) || from_last(corner, 0) != k) return false;
+  return std::all_of(corner.typed_data(), corner.typed_data() + corner.element_count(),
+                     [&](int32_t vertex) { return (uint32_t)vertex < vertices; });
+}
+
 // The faces of several garments, which are read as they are used.
 template <typename T>
 struct Sheet {
@@ -400,12 +408,12 @@ static Sheet<T> sheet(size_t n, const Floats &inverse, const Floats &mu, const F
   return {rows<T>(inverse, 4 * n, first, count), rows<T>(mu, n, first, count), rows<T>(lam, n, first, count)};
 }
 
-// Computes energies of a batch, and their gradients: `add` is given the first garment of several, their positions,
+// Computes energies of elements of a batch, and their gradients: `add` is given the first garment of several, their positions,
 // their gradients, and a sum of energies.
-template <typename Add>
+template <size_t k, typename Add>
 static ffi::Error energies(const Floats &x, const Integers &corner, Result energy, Result gradient, Add add) {
   const size_t V = from_last(x, 1), count = energy->element_count();
-  if (!fit(count, {{&x, 3 * V}}) || !shared(corner)) return unfit();
+  if (!fit(count, {{&x, 3 * V}}) || !among<k>(V, corner)) return unfit();
   in_lanes(count, [&](auto numbers, size_t first) {
     using T = decltype(numbers);
     const Points<T> at = points(rows<T>(x, 3 * V, first, count), V);
@@ -424,7 +432,7 @@ static ffi::Error Stretching(Floats x, Integers corner, Floats inverse, Floats m
   const Elements<3> corners = elements<3>(corner);
   const size_t n = corners.count, count = energy->element_count();
   if (!fit(count, {{&inverse, 4 * n}, {&mu, n}, {&lam, n}})) return unfit();
-  return energies(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+  return energies<3>(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
     stretching(corners, sheet<std::decay_t<decltype(sum.part)>>(n, inverse, mu, lam, first, count), at, by, sum);
   });
 }
@@ -433,7 +441,7 @@ static ffi::Error Bending(Floats x, Integers corner, Floats stiffness, Floats an
   const Elements<4> hinges = elements<4>(corner);
   const size_t n = hinges.count, count = energy->element_count();
   if (!fit(count, {{&stiffness, n}, {&angle, n}})) return unfit();
-  return energies(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+  return energies<4>(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
     using T = std::decay_t<decltype(sum.part)>;
     bending(hinges, rows<T>(stiffness, n, first, count), rows<T>(angle, n, first, count), at, by, sum);
   });
@@ -444,7 +452,7 @@ static ffi::Error EdgeCollision(Floats x, Integers corner, Floats place, Floats 
   const Elements<2> edges = elements<2>(corner);
   const size_t n = edges.count, count = energy->element_count();
   if (!fit(count, {{&place, n}, {&point, 3 * n}, {&normal, 3 * n}})) return unfit();
-  return energies(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
+  return energies<2>(x, corner, energy, gradient, [&](size_t first, const auto &at, auto &by, auto &sum) {
     using T = std::decay_t<decltype(sum.part)>;
     edge_collision(edges, rows<T>(place, n, first, count), rows<T>(point, 3 * n, first, count),
                    rows<T>(normal, 3 * n, first, count), stiffness, offset, at, by, sum);
@@ -464,7 +472,7 @@ static Relaxing<T> relaxing(const Floats &mobility, const Integers &corner, cons
 static ffi::Error Relax(Floats x, Floats mobility, Integers corner, Floats inverse, Floats mu, Floats lam,
                         int32_t steps, float momentum, float longest, Result after) {
   const size_t V = from_last(x, 1), n = from_last(corner, 1), count = after->element_count() / (3 * V);
-  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}) || !shared(corner))
+  if (!fit(count, {{&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}) || !among<3>(V, corner))
     return unfit();
   in_lanes(count, [&](auto numbers, size_t first) {
     using T = decltype(numbers);
@@ -484,7 +492,7 @@ static ffi::Error RelaxBack(Floats cotangent, Floats x, Floats mobility, Integer
                             Floats lam, int32_t steps, float momentum, float longest, Result by) {
   const size_t V = from_last(x, 1), n = from_last(corner, 1), count = by->element_count() / (3 * V);
   if (!fit(count, {{&cotangent, 3 * V}, {&x, 3 * V}, {&mobility, V}, {&inverse, 4 * n}, {&mu, n}, {&lam, n}}) ||
-      !shared(corner))
+      !among<3>(V, corner))
     return unfit();
   in_lanes(count, [&](auto numbers, size_t first) {
     using T = decltype(numbers);

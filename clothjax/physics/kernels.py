@@ -73,19 +73,19 @@ class Sheet(NamedTuple):
     """Faces that stretch."""
 
     inverse: Array  # [F, 4] 1/m
-    mu: Array  # [F] J, times area and thickness ...
+    mu: Array  # [F] J, the material's times area and thickness ...
     lam: Array  # [F] J, ... likewise
 
 
 def stretching(position: Float[Array, "V 3"], rest: Rest, material: Material, mesh: Mesh) -> Float[Array, ""]:
     """Return the sum of `energies.stretching` at positions [V, 3] m, in J."""
-    return _energy(position, (mesh.faces, *_sheet(rest, material)), "ClothStretching")
+    return _energy(position, (_corners(mesh.faces), *_sheet(rest, material)), "ClothStretching")
 
 
 def bending(position: Float[Array, "V 3"], rest: Rest, material: Material, mesh: Mesh) -> Float[Array, ""]:
     """Return the sum of `energies.bending` at positions [V, 3] m, in J."""
     stiffness = material.bending / (8.0 * rest.hinge_area)
-    operands = (mesh.hinges, stiffness, rest.hinge_angle)
+    operands = (_corners(mesh.hinges), stiffness, rest.hinge_angle)
     return _energy(position, operands, "ClothBending")
 
 
@@ -98,9 +98,13 @@ def edge_collision(
         stiffness: J/m^3.
         offset: m.
     """
-    operands = (mesh.edges, contact.place, contact.point_next, contact.normal_next)
+    operands = (_corners(mesh.edges), contact.place, contact.point_next, contact.normal_next)
     settings = (("stiffness", np.float32(stiffness)), ("offset", np.float32(offset)))
     return _energy(position, operands, "ClothEdgeCollision", settings)
+
+
+def _corners(elements: Array) -> Array:
+    return jnp.asarray(elements, jnp.int32)
 
 
 def _sheet(rest: Rest, material: Material) -> Sheet:
@@ -161,7 +165,7 @@ def relaxed(
         longest: m, that the gradient moves a vertex by in a step at most.
     """
     settings = (("steps", np.int32(steps)), ("momentum", np.float32(momentum)), ("longest", np.float32(longest)))
-    return _relaxed(position, (mobility, mesh.faces, *_sheet(rest, material)), settings)
+    return _relaxed(position, (mobility, _corners(mesh.faces), *_sheet(rest, material)), settings)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))

@@ -33,6 +33,8 @@ def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, elsewhere:
     """
     on_cpu = jax.default_backend() == "cpu"
     among = 1 if device_mesh is None else device_mesh.size
+    # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
+    at_once = (os.cpu_count() or 1) if on_cpu and device_mesh is None else 1
 
     @partial(jax.jit, out_shardings=devices.replicated(device_mesh))
     def run(part, *arguments):
@@ -42,7 +44,7 @@ def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, elsewhere:
         each: Any, arguments: tuple, progress: Callable[[int], None] = lambda _: None, folder: Path | None = None
     ) -> Any:
         count = len(jax.tree.leaves(each)[0])
-        size = among * min(ON_CPU if on_cpu else elsewhere, -(-count // among))
+        size = among * min(ON_CPU if on_cpu else elsewhere, -(-count // (among * at_once)))
         arguments = devices.replicate(arguments, device_mesh)
 
         def part_from(start: int):
@@ -59,8 +61,7 @@ def make_sampler(sequence: Callable, device_mesh: Mesh | None = None, elsewhere:
             return found
 
         parts = []
-        # the small operations of a rollout do not fill a CPU's cores: as many programs at once as there are
-        with ThreadPoolExecutor(os.cpu_count() if on_cpu and device_mesh is None else 1) as pool:
+        with ThreadPoolExecutor(at_once) as pool:
             for part in pool.map(part_from, range(0, count, size)):
                 parts.append(part)
                 progress(min(len(parts) * size, count))

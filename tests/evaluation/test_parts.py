@@ -1,5 +1,7 @@
 """How an evaluation goes on after a stop."""
 
+import os
+import time
 from functools import partial
 
 import pytest
@@ -46,25 +48,32 @@ def test_an_evaluation_that_was_stopped_goes_on_where_it_was(tmp_path):
             evaluate(8)
 
 
-def _load(path):
-    """What processes measure: how often it was loaded is in a file."""
-    with path.open("a") as file:
-        file.write("x")
-    return path
+def _load(folder):
+    """What processes measure: each loads it once."""
+    (folder / f"process {os.getpid()}").touch()
+    return folder
 
 
-def _measure(path, name):
+def _measure(folder, name):
+    (folder / name).touch()
     if name == "bad":
         raise ValueError("a bad part")
-    return {"loaded": len(path.read_text()), "name": name}
+    if name == "last":
+        time.sleep(0.5)  # while the error is told
+    return {"name": name}
 
 
 def test_processes_share_the_parts_and_an_error_ends_all(tmp_path):
-    kept, loads = Kept(tmp_path / "measured.json", 1), tmp_path / "loads"
-    parts = [Part(_measure, (name,)) for name in ("a", "b", "c")]
-    found = measure_all(parts, None, partial(_load, loads), kept, 2, lambda done: None)
-    assert [found[part]["name"] for part in parts] == ["a", "b", "c"]
-    assert len(loads.read_text()) <= 2  # once a process
+    def measured(names, jobs):
+        parts = [Part(_measure, (name,)) for name in names]
+        kept = Kept(tmp_path / "measured.json", 1)
+        return measure_all(parts, None, partial(_load, tmp_path), kept, jobs, lambda done: None)
+
+    found = measured("abc", 2)
+    assert [each["name"] for each in found.values()] == ["a", "b", "c"]
+    assert 1 <= len(list(tmp_path.glob("process*"))) <= 2
+    never = [f"{i}" for i in range(20)]
     with pytest.raises(ValueError, match="a bad part"):
-        measure_all([*parts, Part(_measure, ("bad",))], None, partial(_load, loads), kept, 2, lambda done: None)
-    assert set(kept.read()) == {part.name for part in parts}
+        measured(["a", "bad", "last", "last", *never], 2)
+    assert not (tmp_path / never[-1]).exists()
+    assert len(measured("abc", 1)) == 3  # which were kept

@@ -58,9 +58,11 @@ def test_energies_and_their_gradients_are_those_of_jax(crumpled, term):
     x, step = single((x, step))
     of_kernels = jax.jit(kernels.in_kernels(jax.value_and_grad(potential(mesh, config))))
     assert "ffi_call" in str(jax.make_jaxpr(of_kernels)(x, step))
-    found, push = of_kernels(x, step)
-    np.testing.assert_allclose(found, energy, rtol=2e-6)
-    np.testing.assert_allclose(push, gradient, rtol=0, atol=1e-5 * np.abs(gradient).max())
+    of_a_mesh = jax.jit(kernels.in_kernels(lambda x, step, mesh: jax.value_and_grad(potential(mesh, config))(x, step)))
+    assert "ffi_call" in str(jax.make_jaxpr(of_a_mesh)(x, step, mesh))
+    for found, push in (of_kernels(x, step), of_a_mesh(x, step, mesh)):  # which is known or traced
+        np.testing.assert_allclose(found, energy, rtol=2e-6)
+        np.testing.assert_allclose(push, gradient, rtol=0, atol=1e-5 * np.abs(gradient).max())
 
 
 @needs_compilers
@@ -265,10 +267,18 @@ def test_what_kernels_do_not_have_is_refused(crumpled):
 
     vertices, faces = icosphere(1)
     patches = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), proximity.patches(vertices, faces))
-    meshes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), mesh)
-    of_meshes = jax.jit(jax.vmap(kernels.in_kernels(lambda mesh: potential(mesh)(x, step))))
+    of_a_mesh = jax.jit(kernels.in_kernels(lambda mesh: potential(mesh)(x, step)))
+    for wrong in (-1, len(x)):
+        corners = mesh.faces.copy()
+        corners[3, 1] = wrong
+        with pytest.raises(jax.errors.JaxRuntimeError, match="operands do not fit"):
+            jax.block_until_ready(of_a_mesh(mesh._replace(faces=corners)))
+    more = mesh._replace(faces=np.concatenate([mesh.faces, mesh.faces[:, :1]], axis=1))
     with pytest.raises(jax.errors.JaxRuntimeError, match="operands do not fit"):
-        jax.block_until_ready(of_meshes(meshes))
+        jax.block_until_ready(kernels.stretching(jnp.asarray(x), step.rest, step.material, more))
+    meshes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), mesh)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="operands do not fit"):
+        jax.block_until_ready(jax.vmap(of_a_mesh)(meshes))
     search = jax.jit(jax.vmap(kernels.nearest_face, (None, None, 0)))
     with pytest.raises(jax.errors.JaxRuntimeError, match="operands do not fit"):
         jax.block_until_ready(search(x, vertices.astype(np.float32), patches))
@@ -288,8 +298,6 @@ def test_jax_computes_what_kernels_cannot(crumpled):
     x, step = single((x, step))
     assert "ffi_call" in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
     assert "ffi_call" not in str(jax.make_jaxpr(potential(mesh))(x, step))  # not wrapped
-    of_a_mesh = jax.jit(kernels.in_kernels(lambda mesh: potential(mesh)(x, step)))  # which is traced
-    np.testing.assert_allclose(of_a_mesh(mesh), potential(mesh)(x, step), rtol=1e-5)
 
 
 @pytest.mark.parametrize(
