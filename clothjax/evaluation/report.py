@@ -26,6 +26,7 @@ from clothjax.files import configuration, storage
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
+from clothjax.physics import kernels
 from clothjax.physics.energies import GRAVITY
 from clothjax.progress import progress_bar
 from clothjax.runtime import loading, trained
@@ -188,15 +189,18 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
     baseline = config.peer.network
     joints = input_joints(experiment.names, config.stage2)
     make = animators.baseline_animator(joints) if baseline else animators.phi_animator
-    play = jax.jit(lambda m, c, p: rollouts.states(make, m, experiment, c, p))
+    play = jax.jit(kernels.in_kernels(lambda m, c, p: rollouts.states(make, m, experiment, c, p)))
+    programs: dict[tuple, Callable] = {}
 
     def skinned(character: Character, clip: Motion):
         return lambda: skinned_trajectory(experiment, character, windows(clip))
 
     def network(character: Character, clip: Motion):
-        poses = windows(clip)
-        compiled = play.lower(model, character, poses).compile()
-        return lambda: np.asarray(compiled(model, character, poses))
+        given = model, character, windows(clip)
+        kinds = tuple(map(jax.typeof, jax.tree.leaves(given)))
+        if kinds not in programs:
+            programs[kinds] = play.lower(*given).compile()
+        return lambda: np.asarray(programs[kinds](*given))
 
     def psi(character: Character, clip: Motion):
         loaded = loading.load(run, betas=np.asarray(character.betas), material=character.material)
