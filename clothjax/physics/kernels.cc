@@ -269,8 +269,9 @@ static void bending(const Elements<4> &hinges, const Rows<T> &stiffnesses, const
 
 // The energy of edges in the body (incremental_potential.edge_collision), of planes at places between the ends.
 template <typename T>
-static void edge_collision(const Elements<2> &edges, const Rows<T> &places, const Rows<T> &planes, const Rows<T> &normals,
-                           float stiffness, float offset, const Points<T> &x, Points<T> &gradient, Sum<T> &sum) {
+static void edge_collision(const Elements<2> &edges, const Rows<T> &places, const Rows<T> &planes,
+                           const Rows<T> &normals, float stiffness, float offset, const Points<T> &x,
+                           Points<T> &gradient, Sum<T> &sum) {
   const T zero = {};
   for (size_t i = 0; i < edges.count; i++) {
     const size_t p = edges.at(0, i), q = edges.at(1, i);
@@ -408,8 +409,8 @@ static Sheet<T> sheet(size_t n, const Floats &inverse, const Floats &mu, const F
   return {rows<T>(inverse, 4 * n, first, count), rows<T>(mu, n, first, count), rows<T>(lam, n, first, count)};
 }
 
-// Computes energies of elements of a batch, and their gradients: `add` is given the first garment of several, their positions,
-// their gradients, and a sum of energies.
+// Computes energies of elements of a batch, and their gradients: `add` is given the first garment of several, their
+// positions, their gradients, and a sum of energies.
 template <size_t k, typename Add>
 static ffi::Error energies(const Floats &x, const Integers &corner, Result energy, Result gradient, Add add) {
   const size_t V = from_last(x, 1), count = energy->element_count();
