@@ -1,6 +1,6 @@
 """The programs of clothjax: a garment from its training to another engine.
 
-    clothjax train --garment skirt_1000 --stage1.steps 2000 --directory runs/skirt
+    clothjax train --garment skirt_1000 --model.relaxation 4 --stage1.steps 200 --directory runs/skirt
     clothjax evaluate runs/skirt --motions walk_3
     clothjax render skirt --motions dance_3 --out skirt.webp
     clothjax convert skirt --to onnx --int8

@@ -265,6 +265,8 @@ class PhysicsTrainingConfig:
 
     def __post_init__(self):
         _require(self.gradient_frames >= 1, f"gradient_frames must be >= 1, got {self.gradient_frames}")
+        whole = self.batch <= self.pool or self.restart_probability == 1
+        _require(whole, f"a batch of {self.batch} needs a pool of as many simulations, got {self.pool}")
 
 
 @dataclass(frozen=True)
@@ -323,7 +325,7 @@ class PeerConfig:
 
 @dataclass(frozen=True)
 class Stage2Config:
-    """Stage 2: training of the latent predictor. With `forces`, `labels` has the other settings of its training."""
+    """Stage 2: training of the latent predictor. With `forces` only `hidden` is read, and `labels` has the rest."""
 
     steps: int = 6000
     batch: int = 32

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from clothjax import cli
 
 COMMANDS = {
-    "data": "data_prep.anny: makes the embedded body anew",
+    "data": "data_prep.gltf: characters that are not one closed surface; data_prep.anny",
     "export": "clothjax convert, experiments.benchmark, experiments.thesis: ONNX, safetensors",
     "render": "clothjax render, experiments.gallery, quickstart, benchmark, stability, thesis: pictures, video",
     "sweep": "experiments.sweep: several trainings at once",

@@ -4,7 +4,8 @@
 
 It writes `clothjax/assets/models/skirt/`: model.npz, config.yaml, report.json and the card, README.md. The report has
 the measures of the packed model on the validation motions, the command that trained it and its hours. A folder from
-`experiments.tune` is already packed. If the library has a garment of that name, only report and card are written again.
+`experiments.tune` is already packed. Any other garment of that name is replaced. Of a garment of the library, given by
+its name alone, only report and card are written again.
 """
 
 import json

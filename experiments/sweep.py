@@ -70,7 +70,7 @@ def main(argv: list[str]) -> None:
             if name in jobs:
                 raise ValueError(f"two jobs would be called {name}: give every seed once, and garments different names")
             arguments = [chosen.config, *settings, "--garment", garment]
-            for part in ("shapes", "stage1", "stage2", "tuning"):
+            for part in ("shapes", "stage1", "stage2", "labels", "tuning"):
                 arguments += [f"--{part}.seed", str(seed)]
             jobs[name] = (arguments, str(chosen.directory / name))
             _configured(*jobs[name])  # a mistake shows before anything is submitted

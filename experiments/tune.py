@@ -1,11 +1,12 @@
 """Fine-tune Psi of a garment that comes with the library, or of a packed one, on your motions or bodies.
 
-    python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000
+    python -m experiments.tune skirt --out runs/my_skirt --motions my_walk.h5 my_run.h5 --tuning.steps 20000 \
+        --tuning.learning_rate 1.5e-5
 
-Settings default to the garment's own configuration. It writes into the folder `tuning/` and a packed garment, for
-`clothjax.load` and all programs that take a run; report.json has the command and the hours. Run it again to go on where
-it stopped. A garment of the library is configured for evaluation on motion capture too, which does not come with it:
-evaluate with `--motions walk_3`.
+Settings default to the garment's own configuration. A Psi with forces needs a tenth of the usual rate. It writes into
+the folder `tuning/` and a packed garment, for `clothjax.load` and all programs that take a run; report.json has the
+command and the hours. Run it again to go on where it stopped. A garment of the library is configured for evaluation on
+motion capture too, which does not come with it: evaluate with `--motions walk_3`.
 """
 
 import json

@@ -3,7 +3,7 @@
     python -m clothjax train configs/quickstart.yaml
     python -m clothjax train configs/quickstart.yaml --stage1.learning_rate 3e-4 --directory runs/slower
     python -m clothjax train configs/paper_tshirt.yaml --stage1.batch 8 --devices auto
-    python -m clothjax train --garment skirt_1000 --stage1.steps 2000 --directory runs/skirt     # without a file
+    python -m clothjax train --garment skirt_1000 --model.relaxation 4 --stage1.steps 200 --directory runs/skirt
 
 It writes `stage1/` (Phi), `stage2/` (Psi) and `tuning/` (its fine-tuning, if `tuning.steps` is not 0) into the run's
 folder, each with checkpoints, metrics.jsonl and training.json. A baseline has `stage1/` alone. Settings that neither
@@ -43,7 +43,7 @@ def main(argv: list[str]) -> None:
     directory = run_directory(config, settings)
     with devices.together(directory):
         wanted = where.devices or ("auto" if jax.process_count() > 1 else "1")
-        batches = [config.stage1.batch, config.stage2.batch]
+        batches = [config.stage1.batch, *([] if config.stage2.forces else [config.stage2.batch])]
         batches += [config.tuning.batch] if config.tuning.steps > 0 else []
         try:
             train(config, directory, devices.choose(wanted, *batches))

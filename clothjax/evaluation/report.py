@@ -107,6 +107,8 @@ def _evaluated(
     names = list(motions or config.evaluation.motions)
     if not names:
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
+    if len({Path(name).stem for name in names}) < len(names):
+        raise ValueError(f"{run}: two motions would have one name in the report: {', '.join(names)}; rename one")
     for name in names:
         assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
     wearers = assembly.wearers(measured.experiment) if config.evaluation.wearers else ()

@@ -19,7 +19,7 @@ from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
 from clothjax.types import Array, Motion, Pose
 
-SETTLING_FRAMES = 5  # frames left out of averages over time: Psi starts from a garment as skinned
+SETTLING_FRAMES = 5  # frames left out of averages over time: methods start otherwise, from skinning or at rest
 
 
 class Tracks(NamedTuple):

@@ -27,7 +27,7 @@ from clothjax.types import Array, Material, Mesh, Motion, Rest
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; ...
-FORCED = 7  # ... and of one with forces
+FORCED = 8  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -149,6 +149,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         yield _padded(predictor.felt.shares.T)
     if alone is not None and cloth.shown is not None:
         yield from _fabric(alone, cloth.shown.rest, cloth.material, cloth.shown.mobility)
+        yield _padded(predictor.felt.beside.T)
     read, code = network.read, len(network.first)
     assert isinstance(read, Layer)
     inputs = len(scales.middle) - len(cloth.constants)

@@ -113,7 +113,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         advance = g("Transpose", stepped, perm=[0, 2, 1])
         rows = onnx_forces.blended(g, transforms, np.asarray(onnx_forces.parts(model).felt.weights))
         turned = g("Sub", g.slice(pose, 2, 0, 9 * count), g.slice(last, 2, 0, 9 * count))
-        shown = output == "world" and (predictor.felt is None or predictor.felt.mesh is None)
+        shown = output == "world"
         code, touched = onnx_drape.next_code(g, model, rows, transforms, advance, turned, shown)
         low, high = (np.asarray(x) for x in network.code_bounds[:2])
         whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)

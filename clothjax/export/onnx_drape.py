@@ -14,7 +14,7 @@ from clothjax.networks import forces, psi
 from clothjax.networks.forces import KINDS
 from clothjax.physics import relaxation
 from clothjax.runtime import drape, inference
-from clothjax.runtime.models import ForcePredictor, Layer, Model
+from clothjax.runtime.models import Felt, ForcePredictor, Layer, Model
 
 DRAPE = ("change", "garment", "position", "velocity", "still")  # of the state, beside `latent` and `history`
 
@@ -61,7 +61,7 @@ def next_code(
     kinds = [
         onnx_forces.momentum(g, model, it, held),
         onnx_forces.elasticity(g, model, it, held),
-        onnx_forces.contact(g, model, held, *onnx_forces.raised(g, it, planes, held, edges)),
+        onnx_forces.contact(g, model, held, *onnx_forces.raised(g, planes, held, edges, it.template.shape[1])),
     ]
     on_vertices = g("Concat", *(g("Unsqueeze", kind, np.array([1], np.int64)) for kind in kinds), axis=1)
     rotation = g("Unsqueeze", g.slice(rows, 2, 0, 3), np.array([1], np.int64))
@@ -128,8 +128,10 @@ def shown_outside(
         momentum = model.config.model.relaxation_momentum
         outside = g.skinned(garment, transforms, model.network.weights)
         outside = _relaxed(g, model, outside, steps, momentum, alone=True)
-        point, normal = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in touched.vertices)
-        of_shown = targets(outside, (point, normal))
+        sides = np.concatenate([np.asarray(felt.mesh.faces, np.int64)[:, [i, (i + 1) % 3]] for i in range(3)])
+        sides = np.unique(np.sort(sides, axis=1), axis=0)
+        planes = _nearest_beside(g, g("Add", outside, advance), touched, felt)
+        of_shown = targets(outside, onnx_forces.raised(g, planes, outside, sides, len(felt.around), drape.RAISED))
         for _ in range(steps):
             outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, 0.0, alone=True)
         return _pushed_out(g, outside, *of_shown)
@@ -153,6 +155,25 @@ def shown_outside(
     garment = shown_apart(g, model, garment, hung._replace(canonical=g("Add", hung.canonical, back)), transforms)
     near = (g("Gather", row, np.asarray(felt.nearest, np.int64), axis=2) for row in of_vertices)
     return _pushed_out(g, g.skinned(garment, transforms, model.network.weights), *near)
+
+
+def _nearest_beside(g: Graph, position: str, touched: Touched, felt: Felt) -> Planes:
+    """Return the planes of vertices [N, 3, V] m as of `drape._nearest_beside`; positions are where the planes are."""
+    (point, normal), place = touched.vertices, None
+    if touched.edges is not None:
+        assert touched.far is not None
+        place = g("Where", touched.far, np.float32(inference.FARTHEST), touched.edges[0])
+        normal = g("Concat", normal, touched.edges[1], axis=2)
+    beside = np.asarray(felt.beside, np.int64)
+    place = point if place is None else g("Concat", point, place, axis=2)
+    among = g.reshape(g("Gather", place, beside.reshape(-1), axis=2), 3, *beside.shape)
+    normals = g.reshape(g("Gather", normal, beside.reshape(-1), axis=2), 3, *beside.shape)
+    apart = g("Sub", among, g("Unsqueeze", position, np.array([3], np.int64)))
+    apart = g("ReduceSumSquare", apart, axes=[1], keepdims=1)  # [N, 1, V, n]
+    chosen = g("ArgMin", apart, axis=3, keepdims=1)
+    chosen = g("Concat", chosen, chosen, chosen, axis=1)
+    point, normal = (g.reshape(g("GatherElements", rows, chosen, axis=3), 3, len(beside)) for rows in (among, normals))
+    return point, normal
 
 
 def shown_apart(g: Graph, model: Model, garment: str, hung: Hung, transforms: str) -> str:

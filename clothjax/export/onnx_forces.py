@@ -227,15 +227,15 @@ def nearest_planes(g: Graph, among: Searched, positions: str, members: np.ndarra
     return point, normal
 
 
-def raised(g: Graph, it: Parts, planes: Planes, held: str, edges: np.ndarray) -> Planes:
-    """Return planes raised as by `forces.raised`."""
+def raised(g: Graph, planes: Planes, held: str, edges: np.ndarray, vertices: int, times: float = 1.0) -> Planes:
+    """Return planes of so many vertices, raised as by `forces.raised`."""
     if len(edges) == 0:
         return planes
     point, normal = planes
     turned, along = (g("Sub", *(g("Gather", x, edges[:, k], axis=2) for k in range(2))) for x in (normal, held))
     bulge = g("Mul", g.dot(turned, along), np.float32(1 / 8))
-    bulge = g("Min", g("Relu", bulge), np.float32(forces.HIGHEST))
-    of_ends = _at_vertices(g, [bulge, bulge], [edges], it.template.shape[1])
+    bulge = g("Mul", g("Min", g("Relu", bulge), np.float32(forces.HIGHEST)), np.float32(times))
+    of_ends = _at_vertices(g, [bulge, bulge], [edges], vertices)
     height = g("ReduceMax", of_ends, axes=[3], keepdims=0)
     return g("Add", point, g("Mul", height, normal)), normal
 

@@ -9,7 +9,7 @@
 #include <string.h>
 
 #define PLAIN 1           /* version of a file without forces; ... */
-#define FORCED 7          /* ... and with them */
+#define FORCED 8          /* ... and with them */
 #define ALIGN 64          /* bytes, of all arrays */
 #define FARTHEST 1e6f     /* m from the origin */
 #define MOST_JOINTS 1024
@@ -30,6 +30,7 @@
 #define AWAKE 60          /* frames that the cloth moves freely for on a body that stands still; then ... */
 #define SLOWING 0.95f     /* ... in each frame the change of the code shrinks by this */
 #define LONGEST 0.005f    /* m, by which the gradient moves a vertex in a step of relaxation at most */
+#define RAISED 1.5f       /* heights of arcs, of planes that a garment touches which does not feel */
 #define FLAT 1e-3f        /* least determinant of a transform that is inverted */
 
 typedef struct { /* y = bias + scale * (weights (gain * x)); without inputs the bias alone */
@@ -69,6 +70,8 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     const float *weight;                              /* [moving][vertices] */
     const int32_t *around;                            /* [3][vertices that are shown], those that feel, nearest first */
     const float *share;                               /* [3] ... how much of their relaxation it takes */
+    const int32_t *beside;  /* [besides][...] what touches the planes it may touch: those that feel, then their edges */
+    int32_t besides;
     const float *middle, *inverse_spread;             /* of the inputs [(2 + KINDS) code], over BOUND */
     layer unshape, unmix, undecode[MOST_HIDDEN], first; /* transposed shapes, mix, layers of the decoder */
     layer read_fine;                                  /* the rest of the decoder's first, in sixteen bits */
@@ -109,7 +112,8 @@ struct psi_state {
     int32_t *nearest;      /* the face that is nearest */
     float *plane, *raised; /* [4], normal and place of what is touched, from the last root; how far it feels raised */
     float *target;         /* how far outside of it a vertex is pushed to be shown */
-    float *shown, *moved, *aim; /* [3], [3], [1] rows [vertices that are shown], if they are relaxed by themselves */
+    /* [3], [3], [4] and [1] rows [vertices that are shown], if they are relaxed by themselves */
+    float *shown, *moved, *plane_shown, *aim;
     float *eased;          /* [3], what is relaxed, a step before */
     /* rows [edges, to a multiple of LANES] */
     float *between;        /* [3], the middles of edges */
@@ -289,6 +293,8 @@ static void read_forces(reader *r, psi_model *m) {
     if (m->apart) f->share = floats(r, 3 * (size_t)padded(m->vertices));
     m->alone = m->apart && shown > 0;
     if (m->alone) f->shown = read_fabric(r, m->vertices, shown, 1);
+    f->besides = f->edge_clusters ? 6 : 3;
+    if (m->alone) f->beside = indices(r, f->besides * padded(m->vertices), f->vertices + f->edges);
     f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
     f->inverse_spread = floats(r, (2 + KINDS) * (size_t)m->code);
     f->read_fine = read_layer(r, m);
@@ -1323,21 +1329,55 @@ static void push_out(const psi_model *m, const psi_state *s, float *vertices) {
     }
 }
 
-/* How far vertex v in s->shown, relative to the last root, is outside of the plane of the one that feels beside it. */
-static inline float gap_shown(const psi_model *m, const psi_state *s, size_t v) {
-    const size_t wide = padded(m->f.vertices), rows = padded(m->vertices);
-    const float *plane = s->plane + m->f.around[v];
-    float gap = -plane[3 * wide];
-    for (int c = 0; c < 3; c++) gap += plane[c * wide] * s->shown[c * rows + v];
-    return gap;
+/* The planes of vertices in s->shown, relative to the last root: the nearest beside each, drape._nearest_beside. */
+static void find_planes_shown(const psi_model *m, psi_state *s) {
+    const forces *f = &m->f;
+    const size_t wide = padded(f->vertices), edges = padded(f->edges), rows = padded(m->vertices),
+                 faces = padded(f->faces);
+    for (size_t v = 0; v < rows; v++) {
+        float least = INFINITY;
+        for (int k = 0; k < f->besides; k++) {
+            const int32_t beside = f->beside[k * rows + v], edge = beside - f->vertices;
+            if (edge >= 0 && s->target_between[edge] < 0.0f) continue; /* it touches none */
+            const int32_t face = edge < 0 ? s->nearest[beside] : s->nearest_between[edge];
+            float apart = 0.0f;
+            for (int c = 0; c < 3; c++) {
+                const float d = s->centre[c * faces + face] - s->shown[c * rows + v];
+                apart += d * d;
+            }
+            if (!(apart < least)) continue;
+            least = apart;
+            const float *plane = edge < 0 ? s->plane + beside : s->plane_between + edge;
+            for (int c = 0; c < 4; c++) s->plane_shown[c * rows + v] = plane[c * (edge < 0 ? wide : edges)];
+        }
+    }
+}
+
+/* Raises them as raise_planes does, RAISED times as far. */
+static void raise_planes_shown(const psi_model *m, psi_state *s) {
+    const fabric *shown = &m->f.shown;
+    const size_t rows = padded(m->vertices), triangles = padded(shown->triangles);
+    float *raised = s->moved;
+    memset(raised, 0, rows * sizeof(float));
+    for (int32_t t = 0; t < shown->triangles; t++)
+        for (int k = 0; k < 3; k++) {
+            const int32_t a = shown->corner[k * triangles + t], b = shown->corner[(k + 1) % 3 * triangles + t];
+            float bulge = 0.0f;
+            for (size_t c = 0; c < 3 * rows; c += rows)
+                bulge += (s->plane_shown[c + a] - s->plane_shown[c + b]) * (s->shown[c + a] - s->shown[c + b]);
+            bulge = bulge / 8 < m->f.highest ? bulge / 8 : m->f.highest;
+            if (raised[a] < bulge) raised[a] = bulge;
+            if (raised[b] < bulge) raised[b] = bulge;
+        }
+    for (size_t v = 0; v < rows; v++) s->plane_shown[3 * rows + v] += RAISED * raised[v];
 }
 
 static void push_shown(const psi_model *m, psi_state *s) {
-    const size_t wide = padded(m->f.vertices), rows = padded(m->vertices);
-    for (int32_t v = 0; v < m->vertices; v++) {
-        const float *plane = s->plane + m->f.around[v];
-        const float push = limited(s->aim[v] - gap_shown(m, s, v), m->f.deepest);
-        for (int c = 0; c < 3; c++) s->shown[c * rows + v] += push * plane[c * wide];
+    const size_t rows = padded(m->vertices);
+    const float nowhere[3] = {0};
+    for (size_t v = 0; v < rows; v++) {
+        const float push = limited(s->aim[v] - gap_of(s->plane_shown, s->shown, rows, v, nowhere), m->f.deepest);
+        for (int c = 0; c < 3; c++) s->shown[c * rows + v] += push * s->plane_shown[c * rows + v];
     }
 }
 
@@ -1348,10 +1388,11 @@ static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
     for (int32_t v = 0; v < m->vertices; v++)
         for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
     ease_all(&m->f, &m->f.shown, s->shown, s->eased, s->moved);
-    for (int32_t v = 0; v < m->vertices; v++) {
-        const float farthest = gap_shown(m, s, v) + m->f.deepest;
-        s->aim[v] = farthest < m->f.offset ? farthest : m->f.offset;
-    }
+    find_planes_shown(m, s);
+    raise_planes_shown(m, s);
+    const float nowhere[3] = {0};
+    for (size_t v = 0; v < rows; v++) s->aim[v] = m->f.offset;
+    find_targets(&m->f, s->plane_shown, s->shown, rows, nowhere, s->aim);
     for (int32_t n = 0; n < m->f.relaxation; n++) {
         push_shown(m, s);
         ease(&m->f.shown, 0.0f, s->shown, s->eased, s->moved);
@@ -1388,7 +1429,7 @@ int psi_step(const psi_model *m, psi_state *s, const float *rotations, const flo
     bones(m, s);
     int ordinary = 1;
     if (m->forced) {
-        predict_from_forces(m, s, vertices && !m->alone);
+        predict_from_forces(m, s, vertices != NULL);
     } else {
         pose_inputs(m, s, s->inputs);
         for (int32_t i = 0; i < m->pose.inputs; i++) s->inputs[i] -= m->pose_mean[i];
@@ -1452,6 +1493,7 @@ static size_t arrange(const psi_model *m, psi_state *s, float *room) {
     const size_t alone = m->alone ? padded(m->vertices) : 0;
     s->shown = part(room, &used, 3 * alone);
     s->moved = part(room, &used, 3 * alone);
+    s->plane_shown = part(room, &used, 4 * alone);
     s->aim = part(room, &used, alone);
     s->eased = part(room, &used, 3 * (alone > vertices ? alone : vertices));
     const size_t edges = m->f.edge_clusters ? padded(m->f.edges) : 0;

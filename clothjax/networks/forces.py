@@ -17,7 +17,7 @@ KINDS = {"momentum": ("inertia", "gravity"), "elasticity": ("stretching", "bendi
 """Terms of the incremental potential that make up each kind of force: momentum is to where the cloth would fly freely.
 Friction, and contact of cloth with itself, are not felt."""
 DEPTH = 1e-3  # m, at which a felt plane pushes as hard as the collision energy does
-HIGHEST = 0.01  # m, by which a plane is raised at most
+HIGHEST = 0.01  # m, of the height of an arc by which a plane is raised
 SMALLEST = 1e-9  # least eigenvalue of an inverse Hessian, relative to its largest
 
 
@@ -65,17 +65,20 @@ def planes_of(surface: tuple[Array, Array], face: Array) -> Contact:
     return Contact(point, point, normal, normal, face)
 
 
-def raised(planes: Contact, position: Array, edges: Array) -> Contact:
+def raised(planes: Contact, position: Array, edges: Array, times: float = 1.0) -> Contact:
     """Return planes that are raised, so that edges over a round body stay outside of it between their ends.
 
     That is by the height of an arc over its chord, (n_a - n_b) . (x_a - x_b) / 8 for normals n at its ends x. A vertex
     has that of its highest edge. Arguments as of `felt`.
+
+    Args:
+        times: how many heights.
     """
     normal, (start, end) = planes.normal, edges.T
     bulge = jnp.sum((normal[start] - normal[end]) * (position[start] - position[end]), axis=-1) / 8
     bulge = jnp.minimum(bulge, HIGHEST)
     height = jnp.zeros_like(position[:, 0]).at[edges.T].max(bulge)
-    point = planes.point + height[:, None] * normal
+    point = planes.point + times * height[:, None] * normal
     return planes._replace(point=point, point_next=point)
 
 

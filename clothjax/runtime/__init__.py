@@ -1,1 +1,1 @@
-"""A trained garment in use: load, step, specialise. No training, no physics."""
+"""A trained garment in use: load, step, specialise. No training, no simulation."""

@@ -23,6 +23,7 @@ AWAKE = 60  # frames that the cloth moves freely for on a body that stands still
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
 DEEPEST = 0.02  # m, by which a vertex or an edge is pushed out at most: what seems deeper is behind a plane's end
 REACH = 0.05  # m, farther from the middle of an edge a face, by its centroid, is not touched
+RAISED = 1.5  # heights of arcs, of planes that a garment touches which does not feel: relaxation draws its edges in
 
 
 class Touched(NamedTuple):
@@ -68,7 +69,7 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
     """
     parts, offset, outside = _forces(model), model.config.physics.collision_offset, drape.position
     if parts.felt is not None and parts.felt.mesh is not None:
-        return _relaxed_outside(model, shown(model, latent, transforms), touched.vertices, parts.felt)
+        return _relaxed_outside(model, shown(model, latent, transforms), touched, parts.felt)
     edges = forces.touching_edges(parts.mesh, model.config.physics)
 
     def targets(positions: Array, planes: Contact) -> tuple[Array, Array, Array]:
@@ -96,25 +97,39 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
     return contact_search.pushed_out(shown(model, latent, transforms, taken), point, normal, apart, DEEPEST)
 
 
-def _relaxed_outside(model: Model, garment: Array, planes: Contact, felt: Felt) -> Array:
+def _relaxed_outside(model: Model, garment: Array, touched: Touched, felt: Felt) -> Array:
     """Return the garment [V, 3] m that does not feel, relaxed, then pushed out and relaxed in turn.
 
     Args:
         garment: before that.
-        planes: that the garment that feels touches, of which the nearest vertex has that of each of these.
+        touched: by the garment that feels.
     """
     cloth = model.wearer.cloth
     assert cloth is not None and cloth.shown is not None and felt.mesh is not None
     (rest, mobility), mesh, steps = cloth.shown, felt.mesh, relaxation_steps(model)
     momentum = model.config.model.relaxation_momentum
     garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, steps, momentum)
-    point, normal = planes.point_next[felt.nearest], planes.normal_next[felt.nearest]
+    planes = _nearest_beside(garment, touched, felt)
+    sides = jnp.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)])
+    planes = forces.raised(planes._replace(point=planes.point_next), garment, sides, RAISED)
+    point, normal = planes.point_next, planes.normal_next
     gap = contact_search.distance(garment, point, normal)
     apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
     for _ in range(steps):
         garment = contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
         garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, 1, 0.0)
     return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
+
+
+def _nearest_beside(position: Array, touched: Touched, felt: Felt) -> Contact:
+    """Return, for vertices [V, 3] m, the planes of which the points are nearest, among those `Felt.beside`."""
+    assert felt.beside is not None
+    far = jnp.concatenate([jnp.zeros(len(touched.vertices.point), bool), touched.far])
+    both = jax.tree.map(lambda *rows: jnp.concatenate(rows), touched.vertices, touched.edges)
+    apart = jnp.sum((both.point_next[felt.beside] - position[:, None]) ** 2, axis=-1)
+    nearest = jnp.argmin(jnp.where(far[felt.beside], jnp.inf, apart), axis=1)
+    chosen = jnp.take_along_axis(felt.beside, nearest[:, None], axis=1)[:, 0]
+    return jax.tree.map(lambda rows: rows[chosen], both)
 
 
 def begin(model: Model, latent: Array, transforms: Array) -> Drape:

@@ -72,7 +72,7 @@ def build(
     cloth = config.material
     constants = (cloth.density, cloth.mu, cloth.lam, cloth.bending) if material is None else material
     material = Material(*(jnp.asarray(value, jnp.float32) for value in constants))
-    touched = mesh = clusters = placed = own_mesh = None
+    touched = mesh = clusters = placed = own_mesh = beside = None
     if felt is not None:
         placed = on_each_other(felt, garment)
         felt = rigged_like(felt, garment, placed[0])
@@ -81,10 +81,13 @@ def build(
     if isinstance(normalizers, ForceScales):
         touched = reach.reachable(body, garment, config.physics.reach)
         mesh = topology.free_mesh(np.asarray(feels.faces), np.asarray(feels.pinned))
-        clusters = contact_search.clusters(feels, touched, forces.touching_edges(mesh, config.physics))
+        edges = forces.touching_edges(mesh, config.physics)
+        clusters = contact_search.clusters(feels, touched, edges)
+        if placed is not None:
+            beside = _beside(np.asarray(placed[1].corners), np.asarray(edges), len(feels.vertices))
     network, wearer = _arrays(
-        garment, felt, placed, own_mesh, body, touched, clusters, mesh, garment_params, predictor, normalizers, betas,
-        material, config,
+        garment, felt, placed, own_mesh, beside, body, touched, clusters, mesh, garment_params, predictor, normalizers,
+        betas, material, config,
     )  # fmt: skip
     model = Model(
         network=network,
@@ -105,6 +108,7 @@ def _arrays(
     felt: Garment | None,
     placed: tuple[OnMesh, OnMesh] | None,
     own_mesh: Mesh | None,
+    beside: Array | None,
     body: Body,
     touched: Body | None,
     clusters: Clusters | None,
@@ -121,7 +125,8 @@ def _arrays(
     Args:
         felt: the garment that feels, if it is not the one that is shown, and ...
         placed: ... where it lies on that one, and that one on it; and ...
-        own_mesh: ... the elements of that one.
+        own_mesh: ... the elements of that one, ...
+        beside: ... and what touches the planes that each of its vertices may touch, as of `Felt`.
         touched: the part of the body that is felt, ...
         clusters: ... its faces and the garment's vertices and edges in clusters, and ...
         mesh: ... the elements that feel; None without forces.
@@ -177,8 +182,9 @@ def _arrays(
         assert placed is not None
         on_garment, of_garment = placed
         of_felt = _flat(jax.vmap(on_garment.interpolated)(shapes))
-        relaxed_on = own_mesh if config.model.relaxation > 0 else None
-        parts = parts._replace(felt=Felt(of_felt, jnp.asarray(felt.weights).T, *of_garment, relaxed_on))
+        weights = jnp.asarray(felt.weights).T
+        own = (own_mesh, beside) if config.model.relaxation > 0 else ()
+        parts = parts._replace(felt=Felt(of_felt, weights, *of_garment, *own))
     network = Network(
         predictor=parts,
         code_bounds=bounds,
@@ -190,6 +196,16 @@ def _arrays(
         weights=jnp.asarray(garment.weights).T,
     )
     return network, Wearer(bias, template.T, skinning.shaped_joints(body, betas), known, cloth)
+
+
+def _beside(corners: np.ndarray, edges: np.ndarray, vertices: int) -> np.ndarray:
+    """Return `Felt.beside` for the corners [V', 3] of faces, from the edges [E, 2] that touch, of so many vertices."""
+    if len(edges) == 0:
+        return corners
+    number = {tuple(sorted(edge)): vertices + i for i, edge in enumerate(edges.tolist())}
+    ends = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1)  # [V', 3, 2]
+    of_edges = [[number.get((a, b), a) for a, b in face] for face in ends.tolist()]  # an edge of two pinned ones: not
+    return np.concatenate([corners, np.array(of_edges, corners.dtype)], axis=1)
 
 
 def _free(shapes: Array, garment: Garment) -> Array:

@@ -209,7 +209,8 @@ def _feeling_apart(model: Model, around: Array, shares: Array) -> Model:
             number[kept] = np.arange(len(kept))
             faces = number[np.asarray(felt.mesh.faces)]
             inside = (faces >= 0).all(axis=1)
-            felt = felt._replace(mesh=felt.mesh._replace(faces=jnp.asarray(faces[inside], jnp.int32)))
+            mesh = felt.mesh._replace(faces=jnp.asarray(faces[inside], jnp.int32))
+            felt = felt._replace(mesh=mesh, beside=None if felt.beside is None else felt.beside[kept])
             rest, mobility = cloth.shown
             rest = rest._replace(inverse=rest.inverse[inside], face_area=rest.face_area[inside])
             cloth = cloth._replace(shown=ShownCloth(rest, mobility[kept]))

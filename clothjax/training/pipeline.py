@@ -89,7 +89,7 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     """Train all stages of a run, or a baseline; return the seconds that its parts took, by name.
 
     These are `stage1_seconds`, `stage2_seconds`, `tuning_seconds`, `compile_seconds`, `start_seconds` (blend shapes and
-    preconditioner) and `teacher_seconds` (rollouts of Phi).
+    preconditioner) and `teacher_seconds` (rollouts of Phi, or labels).
 
     Raises:
         ValueError: as `prepare` and `loop.fit`.
@@ -117,8 +117,12 @@ def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) ->
     """Load what a run needs, and check the motions that it will be measured on.
 
     Raises:
-        ValueError: for a file that is missing or wrong, of training or of evaluation.
+        ValueError: for a file that is missing or wrong, of training or of evaluation, or steps that calls of `update`
+            do not make up.
     """
+    for name, steps in _all_steps(config).items():
+        if steps < 0 or steps % STEPS_PER_CALL:
+            raise ValueError(f"{name} must be a multiple of {STEPS_PER_CALL}, got {steps}")
     if device_mesh is not None:
         progress.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     experiment = assembly.assemble(config)
@@ -129,6 +133,18 @@ def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) ->
         if count:
             progress.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
     return Run(experiment, directory, clips, device_mesh)
+
+
+def _all_steps(config: Config) -> dict[str, int]:
+    """Return the numbers of training steps that a run will take, by the names of their settings."""
+    steps = {"stage1.steps": config.stage1.steps}
+    if config.peer.network:
+        return steps
+    if config.stage2.forces:
+        steps |= {"labels.steps": config.labels.steps, "labels.last_steps": config.labels.last_steps}
+    else:
+        steps |= {"stage2.steps": config.stage2.steps}
+    return steps | {"tuning.steps": config.tuning.steps}
 
 
 def train_phi(run: Run) -> loop.Fitted:
