@@ -42,7 +42,12 @@ def main(argv: list[str]) -> None:
     parser = cli.Parser("clothjax convert", __doc__)
     cli.model_argument(parser)
     parser.add_argument("--to", choices=FORMATS, default="onnx")
-    parser.add_argument("--out", type=Path, default=None, help="default: GARMENT.onnx and so on, in the run's folder")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=None,
+        help="default: GARMENT.onnx and so on in the run's folder; skirt.onnx of the library's skirt, here",
+    )
     parser.add_argument("--int8", action="store_true", help="eight bits")
     parser.add_argument("--batch", type=_batch, default=1, metavar="N|dynamic", help="characters a call")
     parser.add_argument("--output", choices=["world", "canonical", "none"], default="world", help="of the vertices")
@@ -60,8 +65,10 @@ def main(argv: list[str]) -> None:
     material = None if arguments.material is None else Material(*arguments.material)
     model = loading.load(run, betas=betas, material=material, coarse=arguments.coarse)
     form = FORMATS[arguments.to]
-    shipped = arguments.model in trained.shipped()
-    out = arguments.out or (Path(".") if shipped else run) / f"{Path(model.config.garment).stem}.{form.suffix}"
+    default = run / f"{Path(model.config.garment).stem}.{form.suffix}"
+    if arguments.model in trained.shipped():  # several are of one garment
+        default = Path(f"{arguments.model}{'_coarse' if arguments.coarse else ''}.{form.suffix}")
+    out = arguments.out or default
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
     error = formats.export(model, arguments.to, out, options, about, validation(model))
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")

@@ -47,7 +47,7 @@ def write(model: Model, path: Path, output: Output, about: dict) -> None:
         "rotations": "3 x 3 matrices, row-major, local to the parent joint; the identity is the body's canonical pose",
         "translation": "of the root joint from its canonical place, m",
         "normalisation": "inside the model: give poses as they are",
-        "ok": "false where the wearer, the code or, without forces, the pose was outside of training, and was brought into it",
+        "ok": "false where the wearer, the code or, without forces, the pose was outside of what training has seen",
         "vertices": VERTICES[output],
         "first_latent": np.asarray(model.network.first).tolist(),
         "faces": np.asarray(model.faces).tolist(),

@@ -152,8 +152,8 @@ def converge(
 
     Args:
         steps: most steps.
-        tolerance: half of the slope along the direction that ends the descent, as a share of the energy gained so far,
-            plus as much of 10 mJ.
+        tolerance: half of the slope along the direction, were it not bounded, that ends the descent, as a share of the
+            energy gained so far, plus as much of 10 mJ.
 
     Returns:
         The last code [L], and the number of steps.
@@ -163,7 +163,8 @@ def converge(
 
     def goes_on(carry: tuple[_Iterate, Array]) -> Array:
         at, count = carry
-        left = -0.5 * jnp.sum(at.gradient * at.direction)
+        short = 1.0 - jnp.sum(at.direction**2) / bound**2  # of a direction that is bounded; 1 is not
+        left = -0.5 * jnp.sum(at.gradient * at.direction) / jnp.sqrt(jnp.maximum(short, 1e-6))
         return (count < steps) & ((count < 2) | (left > tolerance * (first.energy - at.energy + 0.01)))
 
     def step(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:

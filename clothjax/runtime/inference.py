@@ -2,8 +2,8 @@
 
 A network is reliable only where it was trained. Inputs of the pose, the character's constants and the code are
 therefore clipped to their range in training. The last pose replaces one that is not finite. The garment stays finite
-whatever comes in, and within a second or two of ordinary input the code forgets the rest. `State.ok` is True for a frame that
-needed none of this; else `State.outside` tells which of `models.CAUSES` it was.
+whatever comes in, and within a second or two of ordinary input the code forgets the rest. `State.ok` is True for a
+frame that needed none of this; else `State.outside` tells which of `models.CAUSES` it was.
 """
 
 import dataclasses

@@ -70,7 +70,7 @@ class Felt(NamedTuple):
     around: Array  # [V', 3] int32, the corners of its face that is nearest to each vertex that is shown, and ...
     shares: Array  # [V', 3] ... how much of their relaxation this one takes; the first share is the largest
     mesh: Mesh | None = None  # on which the garment that is shown is relaxed by itself; None: it takes that share
-    # [V', 3 or 6] int32, then: corners of that face and, counted after all vertices, its edges: it may touch their planes
+    # [V', 3 or 6] int32, then: corners of that face and, counted after all vertices, its edges; it touches their planes
     beside: Array | None = None
 
     @property

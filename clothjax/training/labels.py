@@ -27,6 +27,7 @@ from clothjax.types import Array, ClothState, Pose
 NOISY = 0.2  # share of the frames whose code gets noise
 WILD = (2.0, 0.2)  # a code of Psi's with more energy than so often the held one's, plus so many J, is not followed
 LOST = 200.0  # J, from which on a frame is left out
+BOUND = 1.0  # length of a descent step, in units of the code: labels are up to 14 away, and have no time for short ones
 ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertices
 STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
 SAME = 0.85  # share of what Psi's code lacked in the last frame that a label also tries to start with
@@ -127,7 +128,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             energies = jax.lax.map(lambda z: potential(garment(z)), starts)
             start = starts[jnp.argmin(jnp.where(jnp.isnan(energies), jnp.inf, energies))]
             target, _ = descent.converge(
-                precondition, start, garment, potential, settings.descent_steps, phi.DESCENT_BOUND, settings.tolerance
+                precondition, start, garment, potential, settings.descent_steps, BOUND, settings.tolerance
             )
             labels = Labels(
                 held, state.change, pulls, constants, target, energies[0], energies[2], potential(garment(target))

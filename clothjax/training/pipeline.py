@@ -228,6 +228,9 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
     collect = labels.make_collect(scene, run.clips, config, run.device_mesh)
     update = imitation.make_update(len(inverse), len(constants), config, STEPS_PER_CALL, run.device_mesh)
     state = imitation.blank(garment, whitening, len(constants), config)
+    if done == settings.all_steps and not list(folder.glob("labels_*.npz")):
+        fitted = _fit(run, "stage2", partial(_without_labels, folder), state, done, f"stage 2, {config.garment}")
+        return fitted, _add_seconds(run, teacher_seconds=0.0)
     fitted, data, scales = loop.Fitted(state, 0.0, 0.0), None, state.normalizers
     simulations = labels.begin(scene, run.clips, config)
     folder.mkdir(parents=True, exist_ok=True)
@@ -257,6 +260,11 @@ def train_force_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, 
         now = partial(update, devices.replicate(data, run.device_mesh))
         fitted = _fit(run, "stage2", now, state, settings.all_steps, f"stage 2, {config.garment}")
     return fitted, _add_seconds(run, teacher_seconds=0.0)
+
+
+def _without_labels(folder: Path, state: imitation.TrainingState):
+    """Refuse to go on with stage 2, of which the last checkpoint could not be read and the labels are gone."""
+    raise ValueError(f"{folder}: step {int(state.step)} cannot go on without its labels; remove it to begin anew")
 
 
 def _label(run: Run, collect: Callable, psi: labels.Policy, simulations: pool.Simulation, number: int) -> labels.Round:

@@ -140,6 +140,39 @@ def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
     assert 1e-3 < np.abs(np.asarray(found - unrelaxed)).max() < 0.05
 
 
+def test_what_is_shown_touches_the_faces_that_are_nearest_to_it(coarse, motion):
+    """Or nearly so: they are those of the coarse mesh around it, of which one vertex alone has a face farther off."""
+    model = coarse.model()
+    parts, cloth = model.network.predictor, model.wearer.cloth
+    state = inference.initial_state(model, pose(motion, 1))
+    advance = jnp.asarray(motion.translation[2] - motion.translation[1])
+    rotations, joints = skinning.forward_kinematics(
+        pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
+    )
+    transforms = inference._transforms(model, rotations, joints)
+    code, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, 2), advance, None)
+    shown = np.asarray(drape.shown(model, code, transforms))
+    body = drape._skin(drape._rows(parts.body, transforms), cloth.body.T).T
+    centroids, normals = (np.asarray(rows) for rows in contact_search.centroids(body, parts.faces))
+    apart = cdist(shown, centroids)
+    near = apart.min(axis=1) < 0.05
+    assert near.sum() > 1000
+
+    def farther(points):
+        return np.mean((np.linalg.norm(points - shown, axis=1) - apart.min(axis=1))[near])
+
+    planes = drape._nearest_beside(jnp.asarray(shown), touched, parts.felt)
+    of_one = farther(np.asarray(touched.vertices.point_next[parts.felt.nearest]))
+    assert 0 <= farther(np.asarray(planes.point_next)) < 0.3 * of_one and of_one > 1e-3
+    face = np.argmin(cdist(planes.point_next, centroids), axis=1)
+    np.testing.assert_allclose(planes.normal_next, normals[face], atol=1e-4)
+    nowhere = touched._replace(far=jnp.ones_like(touched.far))  # edges in reach of no face
+    fewer = drape._nearest_beside(jnp.asarray(shown), nowhere, parts.felt)
+    vertices = np.asarray(touched.vertices.point_next)
+    assert cdist(np.asarray(fewer.point_next), vertices).min(axis=1).max() < 1e-6
+    assert np.abs(np.asarray(fewer.point_next - planes.point_next)).max() > 1e-3
+
+
 def test_the_garment_that_feels_is_a_level_of_detail_of_the_same_states(coarse, motion):
     """A scene can change from one to the other in any frame, and they are near each other."""
     fine, rough = coarse.model(betas=np.ones(10)), coarse.model(betas=np.ones(10), coarse=True)

@@ -191,6 +191,20 @@ def test_a_descent_that_converges_stops_sooner_where_the_start_is_better(problem
     assert float(potential(garment(near))) <= float(potential(garment(end))) * (1 + 1e-5)
 
 
+@pytest.mark.parametrize("bound", [0.1, 1.0, 1e3])
+def test_a_descent_converges_as_far_whatever_bounds_its_steps(bound):
+    """Where a bounded step promises little, more is left to gain than that."""
+    stiffness = jnp.array([1.0, 4.0, 9.0])
+    far = jnp.array([3.0, -2.0, 1.0])
+
+    def potential(new):
+        return 0.5 * jnp.sum(stiffness * (new - far) ** 2)
+
+    start = jnp.zeros(3)
+    end, count = descent.converge(lambda g: g / 4, start, lambda code: code, potential, 500, bound, 1e-4)
+    assert float(potential(end)) < 3e-4 * float(potential(start)) and int(count) < 200
+
+
 @pytest.fixture(scope="module")
 def collect(toy):
     experiment, clips, *_ = toy
@@ -501,6 +515,16 @@ def test_the_animator_takes_the_step_of_the_labelled_psi(toy, collect, round_of)
     np.testing.assert_allclose(energy(), new.predicted[0], rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    "part, name, steps", [("labels", "last_steps", 30), ("labels", "steps", -20), ("stage1", "steps", 5)]
+)
+def test_steps_that_calls_do_not_make_up_are_refused_before_anything_else(toy, tmp_path, part, name, steps):
+    config = toy[0].config
+    changed = dataclasses.replace(getattr(config, part), **{name: steps})
+    with pytest.raises(ValueError, match=f"{part}.{name} must be a multiple of 20, got {steps}"):
+        pipeline.prepare(dataclasses.replace(config, **{part: changed}), tmp_path)
+
+
 @pytest.mark.slow
 def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(toy, tmp_path, monkeypatch):
     config = toy[0].config
@@ -550,6 +574,13 @@ def test_a_run_that_is_stopped_between_and_in_rounds_ends_as_one_that_was_not(to
     resumed, _ = pipeline.train_force_psi(stopped, first)
     monkeypatch.setattr(labels, "make_collect", stopping)  # a finished one is read
     assert_same(resumed.state.params, pipeline.train_force_psi(stopped, first)[0].state.params)
+    for path in (tmp_path / "stopped" / "stage2").glob("labels_*.npz"):
+        path.unlink()
+    assert_same(resumed.state.params, pipeline.train_force_psi(stopped, first)[0].state.params)
+    for path in (tmp_path / "stopped" / "stage2" / "checkpoints" / "80").rglob("*"):
+        path.write_bytes(b"") if path.is_file() else None
+    with pytest.raises(ValueError, match="step 60 cannot go on without its labels"):
+        pipeline.train_force_psi(stopped, first)
     assert_same(straight.state.params, resumed.state.params)
     assert_same(straight.state.normalizers, resumed.state.normalizers)
 
