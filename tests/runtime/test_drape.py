@@ -150,8 +150,8 @@ def test_what_is_shown_touches_the_faces_that_are_nearest_to_it(coarse, motion):
         pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
     )
     transforms = inference._transforms(model, rotations, joints)
-    code, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, 2), advance, None)
-    shown = np.asarray(drape.shown(model, code, transforms))
+    _, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, 2), advance, None)
+    shown = np.asarray(drape.shown(model, state.latent, transforms))  # held, as what feels is
     body = drape._skin(drape._rows(parts.body, transforms), cloth.body.T).T
     centroids, normals = (np.asarray(rows) for rows in contact_search.centroids(body, parts.faces))
     apart = cdist(shown, centroids)
