@@ -43,7 +43,7 @@ def test_a_job_for_every_garment_and_seed(config, tmp_path, monkeypatch, capsys)
     told = summary["skirt_1000_3"]["told"]
     assert told[-1] == str(folder / "skirt_1000_3")
     assert told[:5] == [str(config), "--stage1.steps", "20", "--garment", "skirt_1000"]
-    parts = ("shapes", "stage1", "stage2", "tuning")
+    parts = ("shapes", "stage1", "stage2", "labels", "tuning")
     assert told[5:-1] == [word for part in parts for word in (f"--{part}.seed", "3")]
     output = capsys.readouterr().out
     assert "| skirt_1000_1 | 1.5 |" in output and "jobs: 4/4" in output
