@@ -9,9 +9,6 @@ PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 API := runs/api
 MODULES := $(subst /,.,$(patsubst %.py,%,$(filter-out %__init__.py %__main__.py,$(wildcard clothjax/*.py clothjax/*/*.py))))
-# tests compile for minutes and run for seconds: programs that are optimised less are there sooner
-SOONER := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
-TOGETHER := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 .PHONY: quickstart demo docs test test-slow lint types wheel
@@ -26,8 +23,7 @@ docs: $(INSTALLED)  ## the reference of the library, made from its docstrings: r
 	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax $(MODULES)
 
 test: $(INSTALLED)  ## the tests of every day
-	@XLA_FLAGS="$(SOONER) $${XLA_FLAGS:-}" $(PYTHON) -m pytest -m "not slow and not rounding" $(TOGETHER)
-	$(PYTHON) -m pytest -m "rounding and not slow" $(TOGETHER)
+	@$(PYTHON) -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test-slow: $(INSTALLED)  ## the long ones
 	@$(PYTHON) -m pytest -m slow

@@ -147,8 +147,9 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
         yield _padded(felt.weights)
         yield _padded(predictor.felt.around.T)
         yield _padded(predictor.felt.shares.T)
-    if alone is not None and cloth.shown is not None:
+    if predictor.felt is not None and alone is not None and cloth.shown is not None:
         yield from _fabric(alone, cloth.shown.rest, cloth.material, cloth.shown.mobility)
+        assert predictor.felt.beside is not None
         yield _padded(predictor.felt.beside.T)
     read, code = network.read, len(network.first)
     assert isinstance(read, Layer)

@@ -183,8 +183,10 @@ def _arrays(
         on_garment, of_garment = placed
         of_felt = _flat(jax.vmap(on_garment.interpolated)(shapes))
         weights = jnp.asarray(felt.weights).T
-        own = (own_mesh, beside) if config.model.relaxation > 0 else ()
-        parts = parts._replace(felt=Felt(of_felt, weights, *of_garment, *own))
+        feeling = Felt(of_felt, weights, *of_garment)
+        if config.model.relaxation > 0:
+            feeling = feeling._replace(mesh=own_mesh, beside=beside)
+        parts = parts._replace(felt=feeling)
     network = Network(
         predictor=parts,
         code_bounds=bounds,

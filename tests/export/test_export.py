@@ -314,7 +314,6 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.rounding
 @pytest.mark.parametrize("name", ["skip", "scaled", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh", "coarse"])
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)

@@ -242,7 +242,6 @@ def test_c_feels_planes_raised_as_far_as_jax(forced, motion, monkeypatch):
         assert jnp.linalg.norm(found - flat_c - expected) < 0.2 * jnp.linalg.norm(expected)
 
 
-@pytest.mark.rounding
 @pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed"])
 @pytest.mark.parametrize("deepest", [0.02, 0.05])
 def test_c_shows_what_is_outside_of_what_it_touches_as_the_model(forced, name, deepest, motion, monkeypatch):

@@ -171,7 +171,6 @@ def test_the_nearest_face_is_that_of_brute_force(faces):
 
 
 @needs_compilers
-@pytest.mark.rounding
 def test_contact_is_that_of_jax():
     """Of vertices and edges about two dented balls, some deep inside, some on the surface."""
     vertices, faces = icosphere(3)
