@@ -4,6 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from samples import random_force_psi
 
 from clothjax.evaluation import metrics, report
@@ -68,6 +69,14 @@ def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
             assert character.material == material
             frames = report.CHARACTERS_FRAMES
             assert max(which) < frames - 2 if name == "solver" else len(which.translation) == frames
+
+
+def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):
+    experiment = random_force_psi().experiment
+    measured = report.Measured(tmp_path, experiment, None, {}, None)
+    monkeypatch.setattr(report.Measured, "load", lambda *_: measured)
+    with pytest.raises(ValueError, match=r"two motions would have one name in the report: walk_3, mine/walk_3\.h5"):
+        report.evaluate(tmp_path, ["walk_3", "mine/walk_3.h5"])
 
 
 def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatch):

@@ -88,6 +88,14 @@ def test_relaxation_needs_forces_and_few_steps(values, reason):
     assert configuration.from_dict(config_module.Config, {"model": {"relaxation": 16}, "stage2": {"forces": True}})
 
 
+def test_a_batch_needs_a_pool_of_as_many_simulations_unless_all_begin_anew():
+    few = {"stage1": {"batch": 8, "pool": 2}}
+    with pytest.raises(ValueError, match="a batch of 8 needs a pool of as many simulations, got 2"):
+        configuration.from_dict(config_module.Config, few)
+    few["stage1"]["restart_probability"] = 1.0
+    assert configuration.from_dict(config_module.Config, few)
+
+
 def test_a_stored_configuration_without_a_setting_is_older_than_it(tmp_path):
     """What a model was trained with does not change with today's defaults; what a user writes has them."""
     old = configuration.to_dict(config_module.Config())
