@@ -325,7 +325,10 @@ class PeerConfig:
 
 @dataclass(frozen=True)
 class Stage2Config:
-    """Stage 2: training of the latent predictor. With `forces` only `hidden` is read, and `labels` has the rest."""
+    """Stage 2: training of the latent predictor.
+
+    With `forces` only `hidden` and `gated` are read, and `labels` has the rest.
+    """
 
     steps: int = 6000
     batch: int = 32
@@ -339,6 +342,9 @@ class Stage2Config:
     latent_decay: float = 0.1
     """Share of the code that decays in a frame unless the network restores it. Without it, rollouts drift."""
     hidden: tuple[int, ...] = (512, 512)
+    gated: bool = False
+    """With forces, the network also gates them: it predicts how much each direction's own code, change and forces
+    count in a frame. Without, the character alone scales them."""
     forces: bool = True
     """Psi reads the forces on the held garment, and learns from `labels`. False: it reads the pose, and learns from
     rollouts of Phi. Then a frame takes an eighth of the time or less, by runtime, and the cloth has half the swing.
@@ -367,7 +373,10 @@ class LabelsConfig:
     simulations: int = 512
     """Simulations that are labelled in a round, each of its own clip, betas and material. They go on in the next."""
     frames: int = 8
-    """Frames by which a round moves a simulation."""
+    """Labelled frames of a simulation in a round."""
+    stride: int = 1
+    """A label on every so many frames; Psi alone moves the garment in between. What labels ask for lasts: those of
+    frames in a row tell little more than one of them. In the first round every frame is labelled."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
     descent_steps: int = 48
@@ -384,7 +393,7 @@ class LabelsConfig:
     steps: int = 200
     """Training steps of a round."""
     anew: bool = False
-    """Each round begins with the ridge solution of all frames so far, for few frames and steps."""
+    """Each round begins with the linear map of all frames so far, which stays as it is: for few frames and steps."""
     last_steps: int = 8000
     """Training steps on all frames after the last round, by a network drawn anew. 0: none."""
     batch: int = 512
@@ -398,7 +407,7 @@ class LabelsConfig:
     RETIRED: ClassVar[dict[str, Any]] = {"candidates": ANYTHING, "candidate_rollouts": ANYTHING}
 
     def __post_init__(self):
-        for name in ("rounds", "simulations", "frames"):
+        for name in ("rounds", "simulations", "frames", "stride"):
             _require(getattr(self, name) >= 1, f"labels.{name} must be >= 1, got {getattr(self, name)}")
         _require(all(0 <= share <= 1 for share in self.shares), f"labels.shares must be in [0, 1]: {self.shares}")
 

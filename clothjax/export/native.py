@@ -16,7 +16,6 @@ from clothjax.export import sidecar
 from clothjax.geometry.clusters import ASKED, middles
 from clothjax.geometry.proximity import even, halved
 from clothjax.networks import forces, psi
-from clothjax.networks.forces import KINDS
 from clothjax.networks.psi import BOUND
 from clothjax.physics import compilers
 from clothjax.physics.energies import GRAVITY, THICKNESS
@@ -173,7 +172,7 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     yield from _exact(np.asarray(scales.output) * back)
     if predictor.felt is not None:
         yield from _layer(Layer(felt.shapes, template.reshape(-1)), gains=True)
-    assert inputs == (2 + len(KINDS)) * code
+    assert inputs == psi.DIRECTED * code
 
 
 def _fabric(mesh: Mesh, rest: Rest, material: Material, mobility: Array | None) -> Iterator[np.ndarray]:

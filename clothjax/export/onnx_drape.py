@@ -319,7 +319,7 @@ def _predicted(g: Graph, model: Model, it: Parts, pulls: str, share: str) -> str
         share: [N, 1], that is left of its change.
     """
     scales, params, size = it.predictor.scales, it.predictor.params, len(model.network.first)
-    inputs = (2 + len(KINDS)) * size
+    inputs = psi.DIRECTED * size
     change = g("MatMul", "change", np.asarray(scales.whitening.to))
     seen = g("Concat", "latent", change, g.reshape(pulls, len(KINDS) * size), axis=1)
     spread = psi.BOUND * np.asarray(scales.spread)[:inputs]
@@ -335,6 +335,9 @@ def _predicted(g: Graph, model: Model, it: Parts, pulls: str, share: str) -> str
     for number in range(1, len(params["mlp"])):
         layer = params["mlp"][f"dense_{number}"]
         x = g.layer(g("Relu", x), Layer(layer["kernel"], layer["bias"]))
+    if model.config.stage2.gated:
+        products = g.reshape(g("Mul", x, seen), psi.DIRECTED, size)
+        x = g("ReduceSum", products, np.array([1], np.int64), keepdims=0)
     moved_by = g("Add", g.layer(seen, reading(params["linear"])), x)
     change = g("MatMul", moved_by, np.asarray(scales.output) * np.asarray(scales.whitening.back))
     return g("Add", "latent", g("Mul", share, change))

@@ -211,7 +211,7 @@ static int fits_forces(const psi_model *m) {
         good &= m->then[i].inputs == width;
         width = m->then[i].outputs;
     }
-    return good && width == code;
+    return good && (width == code || width == (2 + KINDS) * code);
 }
 
 /* Whether every layer takes what there is for it. */
@@ -1147,7 +1147,9 @@ static void predict_from_forces(const psi_model *m, psi_state *s, int shown) {
         float *swap = y;
         y = z, z = swap;
     }
-    for (int32_t i = 0; i < code; i++) s->next[i] += y[i];
+    const int gated = m->then[m->hidden - 1].outputs > code;
+    for (int k = 0; k < (gated ? 2 + KINDS : 1); k++)
+        for (int32_t i = 0; i < code; i++) s->next[i] += gated ? y[k * code + i] * x[k * code + i] : y[i];
     dense_exact(&f->move, s->next, z, y, s);
     const float share = awake(m, s);
     for (int32_t i = 0; i < code; i++) s->next[i] = s->latent[i] + share * z[i] + sum;

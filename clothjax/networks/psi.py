@@ -9,10 +9,13 @@ from clothjax.body import rotation, skinning
 from clothjax.config import Config, MaterialConfig, Stage2Config
 from clothjax.material import material_inputs, scaled
 from clothjax.networks import mlp
+from clothjax.networks.forces import KINDS
 from clothjax.networks.mlp import MLP, Params
 from clothjax.networks.normalisation import ForceScales, Whitening, bounded
 from clothjax.types import Array, Material, Pose
 
+DIRECTED = 2 + len(KINDS)  # numbers that `ForcePsi` reads of each direction of the code: code, change and forces
+DROPPED = (0.2, 0.3)  # shares that training drops of what a gated MLP reads, and of its last hidden layer
 BOUND = 5.0  # of scaled inputs of `ForcePsi`, approached softly: deep contact pushes thousands of times harder
 
 
@@ -132,10 +135,16 @@ def scaled_inputs(scales: ForceScales, inputs: Array) -> Array:
 
 
 class ForcePsi(nn.Module):
-    """The latent predictor of a Psi with forces: a linear map, which starts as the ridge solution, beside an MLP.
+    """The latent predictor of a Psi with forces: a linear map, which starts as that of all labels, beside an MLP.
 
-    The character scales inputs and layers: feature-wise modulation (FiLM, Perez et al. 2018), as stiff cloth answers a
-    force otherwise than soft. The network of one character, which `of_character` returns, has no scales.
+    What a force does depends on the frame: where cloth touches, how it is bent, how stiff it is. If `gated`, the MLP
+    gives gates: how much more each direction's own code, change and forces count, by which they are multiplied.
+
+    Else the MLP gives a change, and the character scales inputs and layers: feature-wise modulation (FiLM, Perez et al.
+    2018). The network of one character, which `of_character` returns, has no scales.
+
+    With a key for `dropout`, a gated network drops a share of what the MLP reads, and of its last hidden layer
+    (Srivastava et al. 2014).
     """
 
     config: Stage2Config
@@ -146,7 +155,15 @@ class ForcePsi(nn.Module):
     def __call__(self, inputs: Array) -> Array:
         """Return the change [..., L] of the whitened code, over `ForceScales.output`, from `scaled_inputs` [..., N]."""
         linear = mlp.Dense(inputs.shape[-1], self.latent, name="linear")
-        layers = MLP((inputs.shape[-1], *self.config.hidden, self.latent), False, 1e-3, name="mlp")
+        outputs = self.latent * (DIRECTED if self.config.gated else 1)
+        layers = MLP((inputs.shape[-1], *self.config.hidden, outputs), False, 1e-3, name="mlp")
+        if self.config.gated:
+            x, (*hidden, last) = self._dropped(inputs, DROPPED[0]), layers.dense
+            for layer in hidden:
+                x = nn.relu(layer(x))
+            gates = last(self._dropped(x, DROPPED[1]))
+            products = gates * inputs[..., : gates.shape[-1]]
+            return linear(inputs) + jnp.sum(products.reshape(*products.shape[:-1], DIRECTED, self.latent), axis=-2)
         if self.constants == 0:
             return linear(inputs) + layers(inputs)
         felt, constants = inputs[..., : -self.constants], inputs[..., -self.constants :]
@@ -160,6 +177,10 @@ class ForcePsi(nn.Module):
         for number, layer in enumerate(hidden):
             x = nn.relu(layer.biased(layer.product(x) * scales[f"dense_{number}"]))
         return linear.biased(linear.product(seen) * scales["linear"]) + last(x)
+
+    @nn.nowrap
+    def _dropped(self, x: Array, share: float) -> Array:
+        return nn.Dropout(share, deterministic=not self.has_rng("dropout"))(x)
 
 
 def of_character(params: Params, constants: Array) -> Params:

@@ -12,7 +12,6 @@ from jax.sharding import Mesh
 
 from clothjax.config import Config
 from clothjax.networks import mlp, psi
-from clothjax.networks.forces import KINDS
 from clothjax.networks.normalisation import ForceScales, Whitening
 from clothjax.networks.psi import ForcePsi
 from clothjax.training import loop
@@ -23,6 +22,7 @@ SMALL = 0.3  # of the mean square of an ordinary change; frames that change less
 WIDER = 0.1  # of the range of the labels' codes, which Psi may go beyond at either end
 SETTLING = 0.35  # share of the training steps of all rounds, the last ones, in which the learning rate falls, ...
 LAST_SETTLING = 0.6  # ... and of those on all frames
+OWN_RIDGE, BIAS_RIDGE = 10.0, 1e-3  # penalties on what the linear map takes of a direction's own inputs, and on biases
 
 
 class Data(NamedTuple):
@@ -55,7 +55,7 @@ def blank(garment: dict, whitening: Whitening, constants: int, config: Config) -
         constants: number of the constant inputs.
     """
     latent = len(whitening.to)
-    size = (2 + len(KINDS)) * latent + constants
+    size = psi.DIRECTED * latent + constants
     key, model_key = jax.random.split(jax.random.key(config.labels.seed))
     params = mlp.init(ForcePsi(config.stage2, latent, constants), model_key, jnp.zeros(size))
     params = params | {"linear": jax.tree.map(jnp.zeros_like, params["linear"])}
@@ -139,8 +139,12 @@ def weight(targets: Array) -> Array:
 
 
 def optimizer(config: Config, last: bool = False) -> optax.GradientTransformation:
-    """Build AdamW, whose rate stays and then falls along a line to zero: at the end of all rounds, or of the `last`."""
+    """Build AdamW, whose rate stays and then falls along a line to zero: at the end of all rounds, or of the `last`.
+
+    A linear map that stays as it is does not decay.
+    """
     settings = config.labels
+    stays = settings.anew or last
     steps, settling = settings.rounds * settings.steps, SETTLING
     if last:
         steps, settling = settings.last_steps, LAST_SETTLING
@@ -148,21 +152,30 @@ def optimizer(config: Config, last: bool = False) -> optax.GradientTransformatio
     def rate(step):
         return settings.learning_rate * jnp.clip((1.0 - step / steps) / settling, 0.0, 1.0)
 
-    return optax.adamw(rate, weight_decay=settings.decay)
+    def learnt(params):
+        return {name: jax.tree.map(lambda _: name != "linear" or not stays, part) for name, part in params.items()}
+
+    return optax.adamw(rate, weight_decay=settings.decay, mask=learnt)
 
 
 def anew(state: TrainingState, data: Data, network: ForcePsi, config: Config, last: bool) -> TrainingState:
-    """Return the state from which frames are learnt: the linear map is their ridge solution, all else drawn anew.
+    """Return the state from which frames are learnt: the linear map is that of `linear`, all else drawn anew.
 
     A network that learnt the frames of the first rounds first, and longest, generalises worse (Ash & Adams 2020).
     """
     key = jax.random.fold_in(state.key, state.step)
-    params = mlp.init(network, key, jnp.zeros(len(state.normalizers.middle))) | {"linear": ridge(data, config)}
+    linear = linear_map(data, state.normalizers, config)
+    params = mlp.init(network, key, jnp.zeros(len(state.normalizers.middle))) | {"linear": linear}
     return state._replace(params=params, average=params, optimizer=optimizer(config, last).init(params))
 
 
-def ridge(data: Data, config: Config) -> dict[str, Array]:
-    """Solve ridge regression on the frames that are there, with the weights of the loss."""
+def linear_map(data: Data, scales: ForceScales, config: Config) -> dict[str, Array]:
+    """Return the linear map of the frames that are there, with the weights of the loss.
+
+    A direction's change depends most on its own code, change and forces. Their coefficients are least squares; ridge
+    regression of what they leave gives the others. Its penalty is of inputs in their own units: what varies little,
+    tells little.
+    """
     rounds, count = config.labels.rounds, len(data.inputs)
     there = (jnp.arange(count) < data.count).astype(jnp.float32)[:, None]
     rows = jax.tree.map(lambda x: x.reshape(rounds, count // rounds, -1), (data.inputs, data.targets, there))
@@ -178,8 +191,24 @@ def ridge(data: Data, config: Config) -> dict[str, Array]:
     (squares, products), _ = jax.lax.scan(
         add, (jnp.zeros((size + 1, size + 1)), jnp.zeros((size + 1, data.targets.shape[1]))), rows
     )
-    penalty = jnp.full(size + 1, config.labels.ridge).at[-1].set(1e-3)
-    solution = jax.scipy.linalg.solve(squares + jnp.diag(penalty), products, assume_a="pos")
+    latent = data.targets.shape[1]
+    latent = data.targets.shape[1]
+
+    def solved(squares: Array, products: Array, penalty: Array) -> Array:
+        return jax.scipy.linalg.solve(squares + jnp.diag(jnp.append(penalty, BIAS_RIDGE)), products, assume_a="pos")
+
+    def of_own(own: Array, of_one: Array) -> Array:
+        coefficients = solved(squares[jnp.ix_(own, own)], of_one[own], jnp.full(psi.DIRECTED, OWN_RIDGE))
+        return jnp.zeros_like(of_one).at[own].set(coefficients)
+
+    own = np.arange(psi.DIRECTED * latent).reshape(psi.DIRECTED, latent).T  # inputs of each direction, ...
+    own = np.append(own, np.full((latent, 1), size), axis=1)  # ... and its bias
+    solution = jax.vmap(of_own, in_axes=(0, 1), out_axes=1)(jnp.asarray(own), products)
+    left = products - jnp.matmul(squares, solution, precision="highest")
+    spread = scales.spread[: psi.DIRECTED * latent].reshape(psi.DIRECTED, latent)
+    uneven = jnp.mean(spread**2, axis=1, keepdims=True) / spread**2
+    penalty = jnp.append(uneven.reshape(-1), jnp.ones(size - uneven.size))
+    solution += solved(squares, left, config.labels.ridge * penalty)
     return {"kernel": solution[:-1], "bias": solution[-1]}
 
 
@@ -207,8 +236,12 @@ def make_update(
         rows = jax.random.randint(key, (settings.batch,), 0, data.count)
         inputs, targets = data.inputs[rows], data.targets[rows]
 
+        dropout = {"rngs": {"dropout": jax.random.fold_in(key, 1)}} if config.stage2.gated else {}
+
         def loss(params):
-            errors = jnp.mean((mlp.apply(network, params, inputs) - targets) ** 2, axis=-1)
+            if settings.anew or last:
+                params = params | {"linear": jax.lax.stop_gradient(params["linear"])}
+            errors = jnp.mean((mlp.apply(network, params, inputs, **dropout) - targets) ** 2, axis=-1)
             return jnp.mean(weight(targets) * errors)
 
         value, gradient = jax.value_and_grad(loss)(state.params)

@@ -19,6 +19,7 @@ from clothjax.networks.normalisation import ForceScales
 from clothjax.physics import descent, incremental_potential, kernels
 from clothjax.physics.energies import GRAVITY
 from clothjax.simulation import characters, rollout, time_step
+from clothjax.simulation.characters import Window
 from clothjax.simulation.scene import Scene
 from clothjax.training import pool, run_folder, sampling
 from clothjax.training.pool import Simulation
@@ -29,7 +30,7 @@ WILD = (2.0, 0.2)  # a code of Psi's with more energy than so often the held one
 LOST = 200.0  # J, from which on a frame is left out
 BOUND = 1.0  # length of a descent step, in units of the code: labels are up to 14 away, and have no time for short ones
 ON_GPU = 1024  # simulations in one program; 2 GB for a garment of 1 000 vertices
-STILL = 0.25  # share of the simulations whose body holds its pose in a round: Psi must come to rest
+STILL = 0.15  # share of the simulations whose body holds its pose in a round: Psi must come to rest
 SAME = 0.85  # share of what Psi's code lacked in the last frame that a label also tries to start with
 PUSHED = 0.15  # share of the simulations that an external acceleration pushes in a round
 ALIKE = 0.3  # share of the simulations whose cloth is mostly soft in all respects or stiff in all: few draws are either
@@ -97,21 +98,49 @@ def make_segment(scene: Scene, config: Config) -> Callable:
     def segment(one: tuple[Array, Simulation], policy: Policy, clips: Clips) -> Round:
         key, simulation = one
         share_key, noise_key, external_key, new_key, renew_key, still_key = jax.random.split(key, 6)
+        # a Psi that has learnt nothing yet does not move the garment
+        learnt = policy.scales.output > 0
+        stride = jnp.where(learnt, settings.stride, 1)
         character = pool.dressed(scene, simulation.betas, simulation.material, config)
         constants = psi.constant_inputs(character.betas, character.material, config.material)
         scales = policy.scales
-        # a Psi that has learnt nothing yet holds the code: it does not move the garment
-        share = jnp.where(scales.output > 0, jax.random.choice(share_key, jnp.array(settings.shares)), 0.0)
+        share = jnp.where(learnt, jax.random.choice(share_key, jnp.array(settings.shares)), 0.0)
         external = draw_external(external_key, settings.external)
 
         def precondition(gradient: Array) -> Array:
             return jnp.matmul(policy.inverse_hessian, gradient, precision="highest")
 
-        def frame(
-            carry: tuple[ClothState, Array], inputs: tuple[Pose, Array]
-        ) -> tuple[tuple[ClothState, Array], Labels]:
-            (state, lag), (poses, key) = carry, inputs
+        def predicted(state: ClothState, poses: Pose) -> tuple[Window, Array, Array]:
             window = characters.window(scene, character, poses)
+            pulls = animators.forces_on_code(policy.garment, scene, character, state, window, config, external)
+            code = psi.next_code(policy.params, scales, state.latent, state.change, pulls, constants, config.stage2)
+            return window, pulls, jnp.clip(code, scales.low, scales.high)
+
+        def moved(state: ClothState, code: Array, window: Window, poses: Pose, key: Array) -> ClothState:
+            keys = jax.random.split(key, 3)
+            length = settings.noise * jax.random.uniform(keys[0]) / np.sqrt(len(code), dtype=np.float32)
+            length = jnp.where(jax.random.uniform(keys[1]) < NOISY, length, 0.0)
+            noise = length * jax.random.normal(keys[2], code.shape)
+            code += jnp.matmul(noise, scales.whitening.back, precision="highest")
+            new = phi.decode(policy.garment, scene, character, code, window, config.model)
+            velocity = new - state.position
+            state = ClothState(new, velocity, velocity - state.velocity, code, code - state.latent)
+            return rollout.follow(state, poses.translation[2])
+
+        def unlabelled(index: Array, carry: tuple[ClothState, Array]) -> tuple[ClothState, Array]:
+            state, key = carry
+            poses = jax.tree.map(lambda x: x[index], windows)
+            window, _, code = predicted(state, poses)
+            return moved(state, code, window, poses, jax.random.fold_in(key, index)), key
+
+        def labelled(
+            carry: tuple[ClothState, Array], inputs: tuple[Array, Array]
+        ) -> tuple[tuple[ClothState, Array], Labels]:
+            (state, lag), (number, key) = carry, inputs
+            last = (number + 1) * stride - 1
+            state, _ = jax.lax.fori_loop(number * stride, last, unlabelled, (state, key))
+            poses = jax.tree.map(lambda x: x[last], windows)
+            window, pulls, code = predicted(state, poses)
             step = time_step.time_step(scene, character, state, window, 1.0 / config.fps, config, external)
             held = state.latent
 
@@ -121,9 +150,6 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             def potential(new: Array) -> Array:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)
 
-            pulls = animators.forces_on_code(policy.garment, scene, character, state, window, config, external)
-            code = psi.next_code(policy.params, scales, held, state.change, pulls, constants, config.stage2)
-            code = jnp.clip(code, scales.low, scales.high)
             starts = jnp.stack([held, held + state.change, code, code + SAME * lag])
             energies = jax.lax.map(lambda z: potential(garment(z)), starts)
             start = starts[jnp.argmin(jnp.where(jnp.isnan(energies), jnp.inf, energies))]
@@ -135,32 +161,27 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             )
             wild = ~(energies[2] < WILD[0] * energies[0] + WILD[1])
             taken = target + jnp.where(wild, 0.0, share * (code - target))
-            keys = jax.random.split(key, 3)
-            length = settings.noise * jax.random.uniform(keys[0]) / np.sqrt(len(held), dtype=np.float32)
-            length = jnp.where(jax.random.uniform(keys[1]) < NOISY, length, 0.0)
-            noise = length * jax.random.normal(keys[2], held.shape)
-            taken += jnp.matmul(noise, scales.whitening.back, precision="highest")
-            new = garment(taken)
-            velocity = new - state.position
-            state = ClothState(new, velocity, velocity - state.velocity, taken, taken - held)
-            return (rollout.follow(state, poses.translation[2]), target - code), labels
+            return (moved(state, taken, window, poses, jax.random.fold_in(key, last)), target - code), labels
 
         still = jax.random.uniform(still_key) < STILL
-        windows = motion_clips.there_and_back(clips, simulation.frame, settings.frames)
+        count = settings.frames * settings.stride
+        windows = motion_clips.there_and_back(clips, simulation.frame, count)
         stood = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (settings.frames, *x.shape)),
+            lambda x: jnp.broadcast_to(x, (count, *x.shape)),
             motion_clips.standing(motion_clips.poses(clips, simulation.frame)),
         )
-        poses = jax.tree.map(lambda x, y: jnp.where(still, x, y), stood, windows)
+        stood = jax.tree.map(lambda x, y: x.at[0, 0].set(y[0, 0]), stood, windows)  # it has just come to a stop
+        windows = jax.tree.map(lambda x, y: jnp.where(still, x, y), stood, windows)
         keys = jax.random.split(noise_key, settings.frames)
         begun = simulation.cloth, jnp.zeros_like(simulation.cloth.latent)
-        (cloth, _), labels = jax.lax.scan(frame, begun, (poses, keys))
+        (cloth, _), labels = jax.lax.scan(labelled, begun, (jnp.arange(settings.frames), keys))
+        passed = settings.frames * stride
         goes_on = (
             jnp.all(usable(labels))
-            & (clips.remaining[simulation.frame] > 2 * settings.frames)
+            & (clips.remaining[simulation.frame] > 2 * passed)
             & (jax.random.uniform(renew_key) > settings.renewed)
         )
-        later = simulation._replace(cloth=cloth, frame=simulation.frame + jnp.where(still, 0, settings.frames))
+        later = simulation._replace(cloth=cloth, frame=simulation.frame + jnp.where(still, 0, passed))
         new = begin_one(new_key, scene, clips, config)
         return Round(jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), later, new), labels)
 

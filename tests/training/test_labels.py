@@ -440,15 +440,28 @@ def begun(toy, round_of):
 
 
 def test_the_linear_map_begins_at_the_ridge_solution(toy, round_of):
-    """In a second implementation it minimises the weighted squared error of the frames that are there."""
+    """A second implementation: least squares of each direction's own inputs, then all inputs in their own units."""
     _, state, data = learning(toy, round_of)
     found = begun(toy, round_of).params["linear"]
     inputs, targets = (np.asarray(x, np.float64) for x in imitation.examples(round_of, state.normalizers))
     root = np.sqrt(1 / (imitation.SMALL + (targets**2).mean(axis=1)))[:, None]
     size = inputs.shape[1]
-    penalty = np.diag(np.sqrt([toy[0].config.labels.ridge] * size + [1e-3]))
-    rows = np.concatenate([root * np.append(inputs, np.ones((len(inputs), 1)), axis=1), penalty])
-    expected = np.linalg.lstsq(rows, np.concatenate([root * targets, np.zeros((size + 1, targets.shape[1]))]))[0]
+    latent = targets.shape[1]
+
+    def least(inputs, targets, penalty):
+        squares = np.diag(np.sqrt(np.append(penalty, imitation.BIAS_RIDGE)))
+        rows = np.concatenate([root * np.append(inputs, np.ones((len(inputs), 1)), axis=1), squares])
+        return np.linalg.lstsq(rows, np.append(root * targets, np.zeros((len(squares), targets.shape[1])), axis=0))[0]
+
+    expected = np.zeros((size + 1, latent))
+    for j in range(latent):
+        own = [j + k * latent for k in range(5)]
+        expected[[*own, size], j] = least(inputs[:, own], targets[:, [j]], [imitation.OWN_RIDGE] * 5)[:, 0]
+    left = targets - inputs @ expected[:-1] - expected[-1]
+    spread = np.asarray(state.normalizers.spread)[: 5 * latent].reshape(5, latent)
+    units = np.append(spread / np.sqrt((spread**2).mean(axis=1, keepdims=True)), np.ones(size - 5 * latent))
+    of_rest = least(inputs * units, left, [toy[0].config.labels.ridge] * size)
+    expected += np.append(units, 1)[:, None] * of_rest
     atol = 1e-3 * np.abs(expected).max()
     np.testing.assert_allclose(found["kernel"], expected[:-1], atol=atol)
     np.testing.assert_allclose(found["bias"], expected[-1], atol=atol)
@@ -476,13 +489,21 @@ def test_training_begins_anew_at_the_ridge_solution_where_it_is_to(toy, round_of
     for number in range(1, 7):
         from_ridge = moved(solved, states[number], "linear")
         begins = number in (1, 5) or (anew and number == 3)
-        assert (from_ridge < 1.5 * rate) == begins, number  # a step of Adam
+        stays = anew or number > 4
+        assert (from_ridge < 1.5 * rate) == (begins or stays), number  # a step of Adam
+        assert (from_ridge == 0) == stays, number
         drawn = moved(states[number - 1], states[number], "mlp")
         assert (drawn > 20 * rate) == begins, number
 
 
 def test_weights_decay_relative_to_the_rate(toy, round_of):
-    """In the first step, at the full rate, by `decay` times it: the linear map from its ridge solution."""
+    """In the first step, at the full rate, by `decay` times it: the linear map from its ridge solution.
+
+    One that stays as it is does not.
+    """
+    config, state, data = learning(toy, round_of, steps=2, decay=4.0, anew=True)
+    update = imitation.make_update(len(state.normalizers.low), 14, config, 1)
+    assert_same(update(data, jax.tree.map(jnp.array, state))[0].params["linear"], begun(toy, round_of).params["linear"])
     steps = []
     for decay in (0.0, 4.0):
         config, state, data = learning(toy, round_of, steps=2, decay=decay)
