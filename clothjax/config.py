@@ -375,8 +375,8 @@ class LabelsConfig:
     frames: int = 8
     """Labelled frames of a simulation in a round."""
     stride: int = 1
-    """A label on every so many frames; Psi alone moves the garment in between. What labels ask for lasts: those of
-    frames in a row tell little more than one of them. In the first round every frame is labelled."""
+    """A label on every so many frames of a simulation that Psi alone moves: what labels ask for lasts, and those of
+    frames in a row tell little more than one of them. One with a share below 1 has them all, for Psi drifts at first."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
     descent_steps: int = 48

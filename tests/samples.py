@@ -423,13 +423,14 @@ class ForcePsi(NamedTuple):
         )
 
 
-def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, meshes=(), **physics):
+def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, gated=False, meshes=(), **physics):
     """A random Psi with forces whose code decays, within +-`limit`, with either a skip or a ReLU on the weights.
 
     Args:
         meshes: garment, and the garment that feels; by default that of `small`.
 
-    The character scales its inputs and layers by random maps of size `scaled`; by default it does not.
+    The character scales its inputs and layers by random maps of size `scaled`; by default it does not. A `gated` one has
+    gates instead.
     """
     config = small()
     config = dataclasses.replace(
@@ -442,7 +443,7 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, meshes=(), 
             relaxation=relaxation,
             relaxation_momentum=0.5 if relaxation else 0.0,
         ),
-        stage2=dataclasses.replace(config.stage2, forces=True, hidden=(32, 24)),
+        stage2=dataclasses.replace(config.stage2, forces=True, hidden=(32, 24), gated=gated),
         physics=dataclasses.replace(config.physics, **physics),
     )
     if meshes:
@@ -459,7 +460,7 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, meshes=(), 
     }
     mixed = rng.normal(size=(size, size))
     whitening = forces.whitening(0.01 * (mixed @ mixed.T / size + 0.1 * np.eye(size)))
-    count = (2 + len(forces.KINDS)) * size + 14
+    count = psi.DIRECTED * size + 14
     network = psi.ForcePsi(config.stage2, size, 14 if scaled > 0 else 0)
     predictor = mlp.init(network, jax.random.key(1), jnp.zeros(count))
     spread, output = np.repeat([1.0, 1.0, 0.02, 0.02, 3.0, 1.0], [size] * 5 + [14]), 0.3
@@ -471,7 +472,7 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, meshes=(), 
             name: jnp.asarray(scaled * rng.normal(size=x.shape), jnp.float32)
             for name, x in predictor["character"].items()
         }
-    predictor["mlp"]["dense_2"] |= {"kernel": 300 * predictor["mlp"]["dense_2"]["kernel"]}
+    predictor["mlp"]["dense_2"] |= {"kernel": (10 if gated else 300) * predictor["mlp"]["dense_2"]["kernel"]}
     scales = ForceScales(
         *(jnp.asarray(x, jnp.float32) for x in (0.1 * rng.normal(size=count), spread, output)),
         whitening, *(jnp.full(size, x, jnp.float32) for x in (-limit, limit)),

@@ -98,13 +98,12 @@ def make_segment(scene: Scene, config: Config) -> Callable:
     def segment(one: tuple[Array, Simulation], policy: Policy, clips: Clips) -> Round:
         key, simulation = one
         share_key, noise_key, external_key, new_key, renew_key, still_key = jax.random.split(key, 6)
-        # a Psi that has learnt nothing yet does not move the garment
-        learnt = policy.scales.output > 0
-        stride = jnp.where(learnt, settings.stride, 1)
         character = pool.dressed(scene, simulation.betas, simulation.material, config)
         constants = psi.constant_inputs(character.betas, character.material, config.material)
         scales = policy.scales
-        share = jnp.where(learnt, jax.random.choice(share_key, jnp.array(settings.shares)), 0.0)
+        # a Psi that has learnt nothing yet does not move the garment
+        share = jnp.where(scales.output > 0, jax.random.choice(share_key, jnp.array(settings.shares)), 0.0)
+        stride = jnp.where(share < 1, 1, settings.stride)
         external = draw_external(external_key, settings.external)
 
         def precondition(gradient: Array) -> Array:

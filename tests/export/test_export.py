@@ -296,6 +296,7 @@ def forced():
     return {
         "limp": random_force_psi(without=("bending", "gravity"), edge_contact=False).model(material=STIFF),
         "skip": skip.model(),
+        "gated": random_force_psi(gated=True).model(betas=np.ones(10)),
         "scaled": random_force_psi(scaled=0.02).model(betas=np.ones(10)),
         "relu": relu.model(betas=np.ones(10)),
         "mesh": specialise.specialise(mesh),
@@ -314,7 +315,9 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.parametrize("name", ["skip", "scaled", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh", "coarse"])
+@pytest.mark.parametrize(
+    "name", ["skip", "scaled", "gated", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh", "coarse"]
+)
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)
     found = onnx.run_onnx(onnx.to_onnx(model, tmp_path / "g.onnx"), model, clip)
@@ -578,3 +581,12 @@ def test_what_is_not_installed_is_said(model, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "tensorflow", None)
     with pytest.raises(ImportError, match="pip install tensorflow-cpu ai-edge-litert"):
         litert.to_litert(model, tmp_path / "g.tflite")
+
+
+def test_a_garment_of_the_library_is_converted_under_its_own_name(tmp_path, monkeypatch):
+    """Several are of one mesh, and a level of detail is another file."""
+    monkeypatch.chdir(tmp_path)
+    for extra in ((), ("--coarse",)):
+        convert.main(["tshirt_fine", "--to", "safetensors", "--blendshapes", "8", *extra])
+    found = {path.name for path in tmp_path.glob("*.safetensors")}
+    assert found == {"tshirt_fine.safetensors", "tshirt_fine_coarse.safetensors"}

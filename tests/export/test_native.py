@@ -19,7 +19,7 @@ from clothjax.commands import convert
 from clothjax.export import native, onnx, psi_ffi
 from clothjax.files import storage
 from clothjax.geometry import clusters
-from clothjax.networks import forces
+from clothjax.networks import forces, psi
 from clothjax.physics import compilers, contact_search, relaxation
 from clothjax.runtime import drape, inference, models, specialise
 from clothjax.runtime.models import Layer, State
@@ -152,6 +152,7 @@ def forced():
     relaxed = random_force_psi(relaxation=3).model(betas=np.ones(10))
     return {
         "skip": specialise.specialise(skip.model(betas=np.ones(10))),
+        "gated": random_force_psi(gated=True).model(betas=np.ones(10)),
         "relu": relu.model(material=Material(0.2, 2e4, 4e4, 10.0)),  # its bending is left out, or nothing else counts
         "mesh": specialise.specialise(mesh, blendshapes=7),
         "relaxed": relaxed,
@@ -169,7 +170,7 @@ def of_eight_bits(model):
         matrix, _, scale = native.eight_bits(kernel, False)
         return jnp.asarray((scale[:, None] * matrix).T, jnp.float32)
 
-    inputs = slice(0, (2 + len(forces.KINDS)) * size)
+    inputs = slice(0, psi.DIRECTED * size)
     first = mlp["dense_0"]["kernel"].at[inputs].set(eight(mlp["dense_0"]["kernel"][inputs]))
     mlp = {name: layer | {"kernel": eight(layer["kernel"])} for name, layer in mlp.items()}
     mlp["dense_0"] |= {"kernel": first}
@@ -178,7 +179,7 @@ def of_eight_bits(model):
     return dataclasses.replace(model, network=network)
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed", "relaxed mesh", "coarse"])
+@pytest.mark.parametrize("name", ["skip", "gated", "relu", "mesh", "relaxed", "relaxed mesh", "coarse"])
 def test_c_with_forces_steps_as_the_model(forced, name, motion):
     """From the same states, in the median of frames: a vertex between two faces may take the other one."""
     if not psi_ffi.available():

@@ -204,6 +204,39 @@ def test_a_widened_range_holds_what_was_seen_since():
     assert wide.low[0] == scale.low[0] and wide.high[2] == scale.high[2] and wide.high[1] == scale.high[1]
 
 
+def test_a_gated_network_multiplies_the_inputs_of_each_direction_by_gates():
+    """In a second implementation, loop by loop; the character has no scales of its own."""
+    rng = np.random.default_rng(0)
+    network, inputs = psi.ForcePsi(Stage2Config(hidden=(8, 6), gated=True), 4, 3), rng.normal(size=23).astype(np.float32)
+    params = mlp.init(network, jax.random.key(0), jnp.zeros(23))
+    assert set(params) == {"linear", "mlp"} and psi.of_character(params, jnp.ones(3)) is params
+    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), params)
+    kernels, biases = ([np.asarray(params["mlp"][f"dense_{i}"][name]) for i in range(3)] for name in ("kernel", "bias"))
+    x = inputs
+    for kernel, bias in zip(kernels[:2], biases[:2]):
+        x = np.maximum(x @ kernel + bias, 0)
+    gates = x @ kernels[2] + biases[2]
+    expected = inputs @ np.asarray(params["linear"]["kernel"]) + np.asarray(params["linear"]["bias"])
+    for direction in range(4):
+        for kind in range(5):
+            expected[direction] += gates[4 * kind + direction] * inputs[4 * kind + direction]
+    np.testing.assert_allclose(mlp.apply(network, params, inputs), expected, rtol=1e-4, atol=1e-4)
+    one = psi.ForcePsi(network.config, 4)
+    np.testing.assert_array_equal(mlp.apply(one, params, inputs), mlp.apply(network, params, inputs))
+
+
+def test_a_gated_network_drops_what_its_gates_read_not_what_they_multiply():
+    """Without gates nothing is dropped; with them, another part in each draw, and none without a key."""
+    network, inputs = psi.ForcePsi(Stage2Config(hidden=(64,), gated=True), 4, 3), jnp.ones(23)
+    params = mlp.init(network, jax.random.key(0), jnp.zeros(23))
+    alone = params | {"mlp": jax.tree.map(jnp.zeros_like, params["mlp"])}
+    drawn = [{"rngs": {"dropout": jax.random.key(i)}} for i in range(2)]
+    for options in drawn:
+        np.testing.assert_array_equal(mlp.apply(network, alone, inputs, **options), mlp.apply(network, alone, inputs))
+    first, second = (mlp.apply(network, params, inputs, **options) for options in drawn)
+    assert (first != second).all()
+
+
 def test_the_network_of_one_character_is_that_of_all_at_its_constants():
     """Each input and each output of a layer is scaled on its own."""
     rng = np.random.default_rng(0)

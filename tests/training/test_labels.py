@@ -281,6 +281,33 @@ def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finish
     np.testing.assert_array_equal(again.labels.code[::5][on], after.cloth.latent[on])
 
 
+def test_psi_alone_moves_a_garment_between_labels(toy, round_of, monkeypatch):
+    """Labels of every second frame are those of all frames that such a Psi is followed in; a blank Psi has every."""
+    experiment, clips, _, blank = toy
+    monkeypatch.setattr(labels, "WILD", (np.inf, 0.0))
+    monkeypatch.setattr(labels, "STILL", 0.0)
+    learnt, rounds = begun(toy, round_of), {}
+    for stride, frames in ((1, 4), (2, 2)):
+        settings = dataclasses.replace(
+            experiment.config.labels, stride=stride, frames=frames, shares=(1.0,), renewed=0.0, descent_steps=4
+        )
+        config = dataclasses.replace(experiment.config, labels=settings)
+        collect = labels.make_collect(experiment.scene, clips, config)
+        rounds[stride] = collected(toy, collect, learnt)
+    again = collected(toy, collect, blank)
+    first = labels.begin(experiment.scene, clips, experiment.config)
+    all_of_it, some = rounds[1].labels, rounds[2].labels
+    assert len(all_of_it.code) == 8 and len(some.code) == 4
+    for whole, part in zip(all_of_it[:4], some[:4], strict=True):
+        size = np.abs(whole).max()
+        np.testing.assert_allclose(part, whole[1::2], atol=2e-3 * size)
+        assert np.abs(part - whole[::2]).max() > 0.05 * size or part is some.constants
+    on = rounds[2].simulations.frame != first.frame
+    np.testing.assert_array_equal(rounds[1].simulations.frame, rounds[2].simulations.frame)
+    assert (rounds[2].simulations.frame == first.frame + 4).any() and on.all()
+    assert (again.simulations.frame == first.frame + 2).any()
+
+
 def test_simulations_that_begin_anew_have_such_cloth_too(toy, monkeypatch):
     experiment, clips, _, blank = toy
     settings = dataclasses.replace(experiment.config.labels, renewed=1.0, frames=1, descent_steps=1)
