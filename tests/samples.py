@@ -472,7 +472,7 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, gated=False
             name: jnp.asarray(scaled * rng.normal(size=x.shape), jnp.float32)
             for name, x in predictor["character"].items()
         }
-    predictor["mlp"]["dense_2"] |= {"kernel": (10 if gated else 300) * predictor["mlp"]["dense_2"]["kernel"]}
+    predictor["mlp"]["dense_2"] |= {"kernel": (30 if gated else 300) * predictor["mlp"]["dense_2"]["kernel"]}
     scales = ForceScales(
         *(jnp.asarray(x, jnp.float32) for x in (0.1 * rng.normal(size=count), spread, output)),
         whitening, *(jnp.full(size, x, jnp.float32) for x in (-limit, limit)),
