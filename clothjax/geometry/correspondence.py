@@ -54,19 +54,14 @@ def on_each_other(felt: Garment, garment: Garment) -> tuple[OnMesh, OnMesh]:
     return on(felt, garment), on(garment, felt)
 
 
-def rigged_like(felt: Garment, garment: Garment, on_garment: OnMesh) -> Garment:
+def rigged_like(felt: Garment, garment: Garment) -> Garment:
     """Return a garment that feels, skinned and shaped as the one that is shown is where it lies on it.
 
-    Skinning that was diffused onto each apart would hold two meshes of a loose garment millimetres from each other.
-    Pinned vertices keep theirs, as those of the other one do.
-
-    Args:
-        on_garment: of `on_each_other`.
+    Skinning that was diffused onto each apart would hold two meshes of a loose garment millimetres from each other, and
+    stretch a waist that is pinned: pinned vertices take the other one's too.
     """
-    pinned, directions = np.asarray(felt.pinned), np.asarray(garment.shapedirs)
+    on_garment = on_mesh(*(np.asarray(x) for x in (felt.vertices, garment.vertices, garment.faces)))
+    directions = np.asarray(garment.shapedirs)
     weights = np.asarray(on_garment.interpolated(np.asarray(garment.weights)))
     shapes = np.asarray(on_garment.interpolated(directions.reshape(len(directions), -1)))
-    return felt._replace(
-        weights=np.where(pinned[:, None], felt.weights, weights),
-        shapedirs=np.where(pinned[:, None, None], felt.shapedirs, shapes.reshape(-1, *directions.shape[1:])),
-    )
+    return felt._replace(weights=weights, shapedirs=shapes.reshape(-1, *directions.shape[1:]))

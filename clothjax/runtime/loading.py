@@ -75,7 +75,7 @@ def build(
     touched = mesh = clusters = placed = own_mesh = beside = None
     if felt is not None:
         placed = on_each_other(felt, garment)
-        felt = rigged_like(felt, garment, placed[0])
+        felt = rigged_like(felt, garment)
         own_mesh = topology.free_mesh(np.asarray(garment.faces), np.asarray(garment.pinned))
     feels = garment if felt is None else felt
     if isinstance(normalizers, ForceScales):
@@ -290,4 +290,4 @@ def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> t
     shapes = jax.vmap(on_garment.interpolated)(_free(decoder["blendshapes"], garment))
     model = dataclasses.replace(config.model, felt="")
     config = dataclasses.replace(config, garment=config.model.felt, model=model)
-    return config, decoder | {"blendshapes": shapes}, rigged_like(felt, garment, on_garment)
+    return config, decoder | {"blendshapes": shapes}, rigged_like(felt, garment)

@@ -102,7 +102,7 @@ def _felt(felt: Garment, garment: Garment, within: Body | None) -> Felt:
     mesh = topology.free_mesh(np.asarray(felt.faces), np.asarray(felt.pinned))
     clusters = None if within is None else contact_search.clusters(felt, within)
     on_garment, _ = on_each_other(felt, garment)
-    return Felt(rigged_like(felt, garment, on_garment), mesh, clusters, on_garment)
+    return Felt(rigged_like(felt, garment), mesh, clusters, on_garment)
 
 
 def edge_set(undirected: np.ndarray, vertices: int) -> jraph.GraphsTuple:
