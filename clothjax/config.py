@@ -376,7 +376,7 @@ class LabelsConfig:
     """Labelled frames of a simulation in a round."""
     stride: int = 1
     """A label on every so many frames of a simulation that Psi alone moves: what labels ask for lasts, and those of
-    frames in a row tell little more than one of them. One with a share below 1 has them all, for Psi drifts at first."""
+    frames in a row tell little more than one of them. One with a share below 1 has them all: Psi drifts at first."""
     renewed: float = 0.1
     """Share of the simulations that begin anew after a round."""
     descent_steps: int = 48
@@ -393,7 +393,7 @@ class LabelsConfig:
     steps: int = 200
     """Training steps of a round."""
     anew: bool = False
-    """Each round begins with the linear map of all frames so far, which stays as it is: for few frames and steps."""
+    """Each round begins with the linear map of all frames so far, and keeps it as it is: for few frames and steps."""
     last_steps: int = 8000
     """Training steps on all frames after the last round, by a network drawn anew. 0: none."""
     batch: int = 512

@@ -429,8 +429,8 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, gated=False
     Args:
         meshes: garment, and the garment that feels; by default that of `small`.
 
-    The character scales its inputs and layers by random maps of size `scaled`; by default it does not. A `gated` one has
-    gates instead.
+    The character scales its inputs and layers by random maps of size `scaled`; by default it does not. A `gated` one
+    has gates instead.
     """
     config = small()
     config = dataclasses.replace(

@@ -152,8 +152,9 @@ def optimizer(config: Config, last: bool = False) -> optax.GradientTransformatio
     def rate(step):
         return settings.learning_rate * jnp.clip((1.0 - step / steps) / settling, 0.0, 1.0)
 
-    def learnt(params):
-        return {name: jax.tree.map(lambda _: name != "linear" or not stays, part) for name, part in params.items()}
+    def learnt(params: dict) -> dict:
+        all_of_it = jax.tree.map(lambda _: True, params)
+        return all_of_it | {"linear": jax.tree.map(lambda _: not stays, params["linear"])}
 
     return optax.adamw(rate, weight_decay=settings.decay, mask=learnt)
 

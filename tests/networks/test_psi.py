@@ -207,7 +207,10 @@ def test_a_widened_range_holds_what_was_seen_since():
 def test_a_gated_network_multiplies_the_inputs_of_each_direction_by_gates():
     """In a second implementation, loop by loop; the character has no scales of its own."""
     rng = np.random.default_rng(0)
-    network, inputs = psi.ForcePsi(Stage2Config(hidden=(8, 6), gated=True), 4, 3), rng.normal(size=23).astype(np.float32)
+    network, inputs = (
+        psi.ForcePsi(Stage2Config(hidden=(8, 6), gated=True), 4, 3),
+        rng.normal(size=23).astype(np.float32),
+    )
     params = mlp.init(network, jax.random.key(0), jnp.zeros(23))
     assert set(params) == {"linear", "mlp"} and psi.of_character(params, jnp.ones(3)) is params
     params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), params)
