@@ -16,7 +16,16 @@ from clothjax.types import Motion, Pose
 
 
 def test_these_garments_come_with_the_library():
-    assert trained.shipped() == ("dress", "dress_fine", "pants", "skirt", "tshirt", "tshirt_fine", "tshirt_pose")
+    assert trained.shipped() == (
+        "dress",
+        "dress_fine",
+        "pants",
+        "pants_fine",
+        "skirt",
+        "tshirt",
+        "tshirt_fine",
+        "tshirt_pose",
+    )
 
 
 @pytest.mark.parametrize("name", trained.shipped())
