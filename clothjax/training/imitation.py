@@ -144,7 +144,6 @@ def optimizer(config: Config, last: bool = False) -> optax.GradientTransformatio
     A linear map that stays as it is does not decay.
     """
     settings = config.labels
-    stays = settings.anew or last
     steps, settling = settings.rounds * settings.steps, SETTLING
     if last:
         steps, settling = settings.last_steps, LAST_SETTLING
@@ -154,13 +153,18 @@ def optimizer(config: Config, last: bool = False) -> optax.GradientTransformatio
 
     def learnt(params: dict) -> dict:
         all_of_it = jax.tree.map(lambda _: True, params)
-        return all_of_it | {"linear": jax.tree.map(lambda _: not stays, params["linear"])}
+        return all_of_it | {"linear": jax.tree.map(lambda _: not stays(config, last), params["linear"])}
 
     return optax.adamw(rate, weight_decay=settings.decay, mask=learnt)
 
 
+def stays(config: Config, last: bool) -> bool:
+    """Return whether training leaves the linear map as it is: where each round, or the `last` training, begins anew."""
+    return config.labels.anew or last
+
+
 def anew(state: TrainingState, data: Data, network: ForcePsi, config: Config, last: bool) -> TrainingState:
-    """Return the state from which frames are learnt: the linear map is that of `linear`, all else drawn anew.
+    """Return the state from which frames are learnt: the linear map is `linear_map`, all else drawn anew.
 
     A network that learnt the frames of the first rounds first, and longest, generalises worse (Ash & Adams 2020).
     """
@@ -240,7 +244,7 @@ def make_update(
         dropout = {"rngs": {"dropout": jax.random.fold_in(key, 1)}} if config.stage2.gated else {}
 
         def loss(params):
-            if settings.anew or last:
+            if stays(config, last):
                 params = params | {"linear": jax.lax.stop_gradient(params["linear"])}
             errors = jnp.mean((mlp.apply(network, params, inputs, **dropout) - targets) ** 2, axis=-1)
             return jnp.mean(weight(targets) * errors)

@@ -115,13 +115,16 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             code = psi.next_code(policy.params, scales, state.latent, state.change, pulls, constants, config.stage2)
             return window, pulls, jnp.clip(code, scales.low, scales.high)
 
+        def decoded(code: Array, window: Window) -> Array:
+            return phi.decode(policy.garment, scene, character, code, window, config.model)
+
         def moved(state: ClothState, code: Array, window: Window, poses: Pose, key: Array) -> ClothState:
             keys = jax.random.split(key, 3)
             length = settings.noise * jax.random.uniform(keys[0]) / np.sqrt(len(code), dtype=np.float32)
             length = jnp.where(jax.random.uniform(keys[1]) < NOISY, length, 0.0)
             noise = length * jax.random.normal(keys[2], code.shape)
             code += jnp.matmul(noise, scales.whitening.back, precision="highest")
-            new = phi.decode(policy.garment, scene, character, code, window, config.model)
+            new = decoded(code, window)
             velocity = new - state.position
             state = ClothState(new, velocity, velocity - state.velocity, code, code - state.latent)
             return rollout.follow(state, poses.translation[2])
@@ -144,7 +147,7 @@ def make_segment(scene: Scene, config: Config) -> Callable:
             held = state.latent
 
             def garment(code: Array) -> Array:
-                return phi.decode(policy.garment, scene, character, code, window, config.model)
+                return decoded(code, window)
 
             def potential(new: Array) -> Array:
                 return incremental_potential.potential(new, step, scene.mesh, config.physics)

@@ -15,7 +15,7 @@ from clothjax.evaluation import report
 from clothjax.geometry.clusters import nearest_in_clusters
 from clothjax.geometry.proximity import nearest_point
 from clothjax.material import material_inputs
-from clothjax.networks import animators, forces, phi
+from clothjax.networks import animators, forces, mlp, phi
 from clothjax.networks.psi import ForcePsi
 from clothjax.physics import compilers, contact_search, descent, incremental_potential, kernels
 from clothjax.physics.energies import GRAVITY
@@ -281,6 +281,22 @@ def test_simulations_go_on_where_the_round_before_left_them(toy, collect, finish
     np.testing.assert_array_equal(again.labels.code[::5][on], after.cloth.latent[on])
 
 
+def test_a_body_that_stops_comes_from_its_last_pose(toy, monkeypatch):
+    """In the first frame of a round in which it stands; in the others the pose before is the same."""
+    experiment, clips, _, blank = toy
+    settings = dataclasses.replace(experiment.config.labels, frames=3, descent_steps=1)
+    config = dataclasses.replace(experiment.config, labels=settings)
+
+    def apart(_garment, _scene, _character, state, window, *_):
+        moved = jnp.sum(jnp.abs(window.current.garment - window.previous.garment))
+        return jnp.full((len(forces.KINDS), len(state.latent)), moved)
+
+    monkeypatch.setattr(labels.animators, "forces_on_code", apart)
+    monkeypatch.setattr(labels, "STILL", 1.0)
+    found = collected(toy, labels.make_collect(experiment.scene, clips, config), blank).labels.forces[:, 0, 0]
+    assert (found[::3] > 0.01).all() and (found[1::3] < 1e-4).all() and (found[2::3] < 1e-4).all()
+
+
 def test_psi_alone_moves_a_garment_between_labels(toy, round_of, monkeypatch):
     """Labels of every second frame are those of all frames that such a Psi is followed in; a blank Psi has every."""
     experiment, clips, _, blank = toy
@@ -521,6 +537,30 @@ def test_training_begins_anew_at_the_ridge_solution_where_it_is_to(toy, round_of
         assert (from_ridge == 0) == stays, number
         drawn = moved(states[number - 1], states[number], "mlp")
         assert (drawn > 20 * rate) == begins, number
+
+
+def test_a_gated_network_is_trained_with_dropout(toy, round_of):
+    """The loss of a step is that of its rows and its draw; the linear map stays as it is."""
+    _, _, params, blank = toy
+    config, _, _ = learning(toy, round_of, steps=2, anew=True)
+    config = dataclasses.replace(config, stage2=dataclasses.replace(config.stage2, gated=True))
+    whitening = blank.normalizers.whitening
+    state = imitation.first(imitation.blank(params["garment"], whitening, 14, config), round_of)
+    data = imitation.extended(imitation.room(round_of, state.normalizers, config), round_of, state.normalizers)
+    network = ForcePsi(config.stage2, len(state.normalizers.low), 14)
+    solved = imitation.anew(state, data, network, config, last=False)
+    key = jax.random.fold_in(state.key, 0)
+    rows = jax.random.randint(key, (config.labels.batch,), 0, len(round_of.code))
+
+    def loss(**options):
+        errors = mlp.apply(network, solved.params, data.inputs[rows], **options) - data.targets[rows]
+        return jnp.mean(imitation.weight(data.targets[rows]) * jnp.mean(errors**2, axis=-1))
+
+    expected, without = loss(rngs={"dropout": jax.random.fold_in(key, 1)}), loss()
+    update = imitation.make_update(len(state.normalizers.low), 14, config, 1)
+    after, metrics = update(data, jax.tree.map(jnp.array, state))
+    assert abs(metrics["loss"][0] - expected) < 0.1 * abs(expected - without)
+    assert moved(solved, after, "linear") == 0 < moved(solved, after, "mlp")
 
 
 def test_weights_decay_relative_to_the_rate(toy, round_of):
