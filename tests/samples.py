@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.sparse
 import trimesh
 from scipy.spatial import ConvexHull
@@ -31,6 +32,11 @@ from clothjax.training import laplacian_shapes
 from clothjax.types import Body, Contact, EdgeContact, Garment, Material, Motion, SelfContact
 
 # Shapes
+
+
+def slowly(*values) -> list:
+    """These as parameters of a test, which `make test` leaves to `make test-slow`."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 def icosphere(rounds=2, radius=1.0):

@@ -88,6 +88,7 @@ def test_the_parts_of_inference(tmp_path, monkeypatch):
         assert variants["C: folded"]["error_mm"] < variants["folded, int8"]["error_mm"]
 
 
+@pytest.mark.slow
 def test_ncs_has_the_size_that_was_published_and_its_split(tmp_path):
     import onnx
 

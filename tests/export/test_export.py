@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from samples import ROOT, apart, random_force_psi, random_model
+from samples import ROOT, apart, random_force_psi, random_model, slowly
 from toy import assert_same, small
 
 from clothjax.body import skinning
@@ -316,7 +316,8 @@ def stiff(model):
 
 
 @pytest.mark.parametrize(
-    "name", ["skip", "scaled", "gated", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh", "coarse"]
+    "name",
+    ["skip", "gated", "coarse", *slowly("scaled", "relu", "mesh", "few", "limp", "relaxed", "relaxed mesh")],
 )
 def test_onnx_of_forces_is_the_model_in_closed_loop(forced, name, motion, tmp_path):
     model, clip = forced[name], Motion(motion.rotations[:10], motion.translation[:10], motion.fps)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from samples import ROOT, apart, random_force_psi, random_model
+from samples import ROOT, apart, random_force_psi, random_model, slowly
 
 import clothjax as cj
 from clothjax.body import skinning
@@ -179,7 +179,7 @@ def of_eight_bits(model):
     return dataclasses.replace(model, network=network)
 
 
-@pytest.mark.parametrize("name", ["skip", "gated", "relu", "mesh", "relaxed", "relaxed mesh", "coarse"])
+@pytest.mark.parametrize("name", ["skip", "gated", "coarse", *slowly("relu", "mesh", "relaxed", "relaxed mesh")])
 def test_c_with_forces_steps_as_the_model(forced, name, motion):
     """From the same states, in the median of frames: a vertex between two faces may take the other one."""
     if not psi_ffi.available():
@@ -243,7 +243,7 @@ def test_c_feels_planes_raised_as_far_as_jax(forced, motion, monkeypatch):
         assert jnp.linalg.norm(found - flat_c - expected) < 0.2 * jnp.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("name", ["skip", "relu", "mesh", "relaxed"])
+@pytest.mark.parametrize("name", ["mesh", "relaxed", *slowly("skip", "relu")])
 @pytest.mark.parametrize("deepest", [0.02, 0.05])
 def test_c_shows_what_is_outside_of_what_it_touches_as_the_model(forced, name, deepest, motion, monkeypatch):
     """From where its own garment hangs, so that the rounding of the decoder is the same."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
-from samples import random_force_psi, random_model
+from samples import random_force_psi, random_model, slowly
 from scipy.spatial.distance import cdist
 
 import clothjax as cj
@@ -69,7 +69,7 @@ def stiff(model):
     return dataclasses.replace(model, wearer=model.wearer._replace(cloth=cloth))
 
 
-@pytest.mark.parametrize("kind", ["forced", "relaxing", "coarse"])
+@pytest.mark.parametrize("kind", ["forced", "coarse", *slowly("relaxing")])
 def test_it_is_the_animator_of_training(kind, motion, request):
     """Frame by frame from the same state, over a dance."""
     forced = request.getfixturevalue(kind)
@@ -367,7 +367,7 @@ def test_a_motion_is_animated_with_an_acceleration_for_each_frame(model, motion)
     assert np.abs(pushed[4] - calm[4]).max() > 1e-4
 
 
-@pytest.mark.parametrize("steps", [0, 3])
+@pytest.mark.parametrize("steps", [3, *slowly(0)])
 def test_on_a_body_that_stands_it_comes_to_rest_until_something_moves_or_pushes_it(steps, motion):
     """A random network never does by itself. Its code is not clipped: a clipped change would not shrink."""
     model = random_force_psi(limit=1e3, relaxation=steps).model()
@@ -402,7 +402,7 @@ def test_a_psi_without_forces_refuses_an_acceleration(motion):
         inference.step(model, state, pose(motion, 1), external=jnp.zeros(3))
 
 
-@pytest.mark.parametrize("kind", ["forced", "relaxing"])
+@pytest.mark.parametrize("kind", ["relaxing", *slowly("forced")])
 def test_a_part_and_another_mesh_feel_what_the_whole_feels(kind, motion, request):
     forced = request.getfixturevalue(kind)
     model = forced.model(betas=np.linspace(-1, 1, 10))
@@ -424,13 +424,17 @@ def test_a_part_and_another_mesh_feel_what_the_whole_feels(kind, motion, request
         specialise.on_mesh(mesh, forced.experiment.garment, np.zeros(10))
 
 
-def test_specialised_it_is_the_same_and_with_fewer_shapes_nearly(forced, model, motion):
+def test_specialised_it_is_the_same(model, motion):
     whole = np.asarray(inference.animate(model, motion)[0])
     small = specialise.specialise(model)
     assert len(small.moving) < len(model.moving) == small.wearer.joints.shape[0]
     np.testing.assert_allclose(inference.animate(small, motion)[0], whole, atol=2e-5)
     equalised, _ = inference.animate(specialise.equalised(small), motion)
     np.testing.assert_allclose(equalised[:3], whole[:3], atol=1e-4)  # a random network magnifies rounding
+
+
+@pytest.mark.slow
+def test_specialised_with_fewer_shapes_it_is_nearly_the_same(forced, model, motion):
     mesh = specialise.on_mesh(model, forced.experiment.garment, np.linspace(-1, 1, 10))
     first = inference.initial_state(model, pose(motion, 0))
     expected, moved = (inference.step(model, first, pose(motion, frame))[1] for frame in (1, 8))
@@ -459,7 +463,7 @@ def test_specialised_it_relaxes_as_before(relaxing, motion):
         assert apart < np.abs(unrelaxed.position - expected.position).mean()
 
 
-@pytest.mark.parametrize("kind", ["forced", "relaxing"])
+@pytest.mark.parametrize("kind", ["relaxing", *slowly("forced")])
 def test_a_crowd_is_each_of_its_characters(kind, motion, request):
     forced = request.getfixturevalue(kind)
     wearers = [forced.model(betas=np.full(10, i), material=Material(0.2 + 0.1 * i, 2e4, 4e4, 1e-5)) for i in range(2)]
