@@ -9,6 +9,7 @@ PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 API := runs/api
 DAILY := -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+COMPARED := tests/export tests/physics/test_kernels.py
 MODULES := $(subst /,.,$(patsubst %.py,%,$(filter-out %__init__.py %__main__.py,$(wildcard clothjax/*.py clothjax/*/*.py))))
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
@@ -23,12 +24,11 @@ demo: $(INSTALLED)  ## a character that you steer, live in the browser
 docs: $(INSTALLED)  ## the reference of the library, made from its docstrings: runs/api/index.html
 	@$(PYTHON) -m pdoc --docformat google --output-directory $(API) clothjax $(MODULES)
 
-# Half of a test's time is compilation. Exports are compared with other compilers' programs, so compiled as users do.
+# Half of a test's time is compilation. What is compared with programs of other compilers is compiled as users do.
 test: $(INSTALLED)  ## the tests of every day
-	@export XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false $${XLA_FLAGS:-}"
-	$(PYTHON) -m pytest $(DAILY) --ignore tests/export
-	unset XLA_FLAGS
-	$(PYTHON) -m pytest $(DAILY) tests/export
+	@XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false $${XLA_FLAGS:-}" \
+	    $(PYTHON) -m pytest $(DAILY) $(COMPARED:%=--ignore %)
+	$(PYTHON) -m pytest $(DAILY) $(COMPARED)
 
 test-slow: $(INSTALLED)  ## the long ones
 	@$(PYTHON) -m pytest -m slow
