@@ -19,7 +19,7 @@ import jax
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-LONGEST = ("test_experiments.py",)
+LONGEST = ("test_experiments.py", "test_drape.py")
 
 
 def pytest_collection_modifyitems(items):
