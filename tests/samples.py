@@ -31,12 +31,13 @@ from clothjax.simulation import assembly
 from clothjax.training import laplacian_shapes
 from clothjax.types import Body, Contact, EdgeContact, Garment, Material, Motion, SelfContact
 
-# Shapes
-
 
 def slowly(*values) -> list:
     """These as parameters of a test, which `make test` leaves to `make test-slow`."""
     return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+
+
+# Shapes
 
 
 def icosphere(rounds=2, radius=1.0):
