@@ -92,12 +92,15 @@ def relaxed(
     """
     if steps > 0 and kernels.used(position):
         return kernels.relaxed(position, mobility, rest, material, mesh, steps, momentum, LONGEST)
-    elastic, before = Elastic(rest.inverse, rest.face_area, material.mu, material.lam), position
-    for _ in range(steps):
+    elastic = Elastic(rest.inverse, rest.face_area, material.mu, material.lam)
+
+    def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        position, before = carry
         move = -(1.0 + momentum) * mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)
         length = jnp.sum(move * move, axis=-1, keepdims=True)
         move = move / jnp.sqrt(1.0 + length / LONGEST**2)
         if momentum > 0:
             move += momentum * (position - before)
-        position, before = position + move, position
-    return position
+        return (position + move, position), None
+
+    return jax.lax.scan(step, (position, position), None, length=steps)[0][0]

@@ -147,9 +147,8 @@ def training_rollout(
 
     def body(carry, index):
         state, frame, fresh = carry
-        cut = index % config.stage1.gradient_frames == 0
         memory = state.latent
-        state = jax.tree.map(lambda x: jnp.where(cut, jax.lax.stop_gradient(x), x), state)
+        state = _cut(state, index, config.stage1.gradient_frames)
         if animator.recurrent:
             state = state._replace(latent=memory)
         poses = motion_clips.poses(clips, frame)
@@ -173,6 +172,14 @@ def training_rollout(
     (state, frame, fresh), (loss, terms, seen) = jax.lax.scan(body, (state, frame, fresh), jnp.arange(frames))
     terms = {name: jnp.mean(value) for name, value in terms.items()}
     return jnp.mean(loss), (jax.lax.stop_gradient(state), terms, jax.lax.stop_gradient(seen))
+
+
+def _cut(state: ClothState, index: Array, frames: int) -> ClothState:
+    """Return a state at a frame of a rollout, constant for gradients where `frames` of them have passed."""
+    constant = jax.lax.stop_gradient(state)
+    if frames == 1:  # known when traced: then nothing is differentiated only to be multiplied by zero
+        return constant
+    return jax.tree.map(lambda a, b: jnp.where(index % frames == 0, a, b), constant, state)
 
 
 def play(animator: Animator, scene: Scene, character: Character, poses: Pose, config: Config) -> Track:
