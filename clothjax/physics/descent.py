@@ -67,22 +67,21 @@ def _solved(lower: Array, right: Array, *, transposed: bool = False) -> Array:
     return jax.lax.linalg.triangular_solve(lower, right[:, None], **settings)[:, 0]
 
 
-def _first(latent: Array, objective: Objective, precondition: Precondition, bound: float) -> _Iterate:
-    """Return the descent before its first step."""
-    energy, gradient = objective(latent)
+def _blank(latent: Array) -> _Iterate:
+    """Return a descent of which nothing is known but its first code [L]: the first `_step` evaluates and keeps that."""
     steps = jnp.zeros((MEMORY, len(latent)), latent.dtype)
-    one = jnp.ones((), latent.dtype)
     products = jnp.zeros((MEMORY, MEMORY), latent.dtype)
-    first = _Iterate(latent, energy, gradient, gradient, one, steps, steps, products, jnp.int32(0))
-    return first._replace(direction=_direction(first, precondition, bound))
+    one, none = jnp.ones((), latent.dtype), jnp.zeros_like(latent)
+    return _Iterate(latent, jnp.inf * one, none, none, one, steps, steps, products, jnp.int32(0))
 
 
 def _step(last: _Iterate, objective: Objective, precondition: Precondition, bound: float) -> _Iterate:
-    """Try one step: take it if the energy falls enough, else try a shorter one next."""
+    """Try one step: take it if the energy falls enough, else try a shorter one next. It is the only evaluation."""
     tried = last.latent + last.share * last.direction
     energy, gradient = objective(tried)
     slope = last.share * jnp.sum(last.gradient * last.direction)
     falls = energy <= last.energy + SUFFICIENT * slope + ROUNDING * jnp.abs(last.energy)
+    falls |= last.energy == jnp.inf  # a first energy is kept even if it is not a number
     move, turn = tried - last.latent, gradient - last.gradient
     curvature = jnp.sum(move * turn)
     convex = falls & (curvature > 1e-10 * jnp.sqrt(jnp.sum(move * move) * jnp.sum(turn * turn)))
@@ -135,8 +134,11 @@ def descend(
         The last code [L].
     """
     objective = jax.value_and_grad(lambda code: potential(garment(code)))
-    first = _first(latent, objective, precondition, bound)
-    return jax.lax.scan(lambda at, _: (_step(at, objective, precondition, bound), None), first, length=steps)[0].latent
+
+    def step(at: _Iterate, _: None) -> tuple[_Iterate, None]:
+        return _step(at, objective, precondition, bound), None
+
+    return jax.lax.scan(step, _blank(latent), None, length=1 + steps)[0].latent
 
 
 def converge(
@@ -159,19 +161,20 @@ def converge(
         The last code [L], and the number of steps.
     """
     objective = jax.value_and_grad(lambda code: potential(garment(code)))
-    first = _first(latent, objective, precondition, bound)
 
-    def goes_on(carry: tuple[_Iterate, Array]) -> Array:
-        at, count = carry
+    def goes_on(carry: tuple[_Iterate, Array, Array]) -> Array:
+        at, first, count = carry
         short = 1.0 - jnp.sum(at.direction**2) / bound**2  # of a direction that is bounded; 1 is not
         left = -0.5 * jnp.sum(at.gradient * at.direction) / jnp.sqrt(jnp.maximum(short, 1e-6))
-        return (count < steps) & ((count < 2) | (left > tolerance * (first.energy - at.energy + 0.01)))
+        return (count < steps) & ((count < 2) | (left > tolerance * (first - at.energy + 0.01)))
 
-    def step(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:
-        at, count = carry
-        return _step(at, objective, precondition, bound), count + 1
+    def step(carry: tuple[_Iterate, Array, Array]) -> tuple[_Iterate, Array, Array]:
+        last, first, count = carry
+        at = _step(last, objective, precondition, bound)
+        return at, jnp.where(count < 0, at.energy, first), count + 1
 
-    at, count = jax.lax.while_loop(goes_on, step, (first, jnp.int32(0)))
+    blank = _blank(latent)
+    at, _, count = jax.lax.while_loop(goes_on, step, (blank, blank.energy, jnp.int32(-1)))
     return at.latent, count
 
 
@@ -187,8 +190,9 @@ def warm_start(
         latent, change: [L], the current code and its change in the last frame.
         garment, potential: as of `descend`.
     """
-    here, there = latent, latent + change
-    return jnp.where(potential(garment(there)) < potential(garment(here)), there, here)
+    both = jnp.stack([latent, latent + change])
+    here, there = jax.lax.map(lambda code: potential(garment(code)), both)
+    return jnp.where(there < here, both[1], both[0])
 
 
 def hessian(energy: Callable[[Array], Array], latent: Array) -> Array:

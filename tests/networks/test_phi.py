@@ -86,8 +86,9 @@ def test_the_direction_is_that_of_dense_bfgs(known, newest):
         dense = part @ dense @ part.T + np.outer(move, move) / (move @ turn)
     rows = (newest - np.arange(known)) % descent.MEMORY
     with jax.enable_x64(True):
-        at = descent._first(jnp.zeros(size), lambda _: (0.0, jnp.asarray(gradient)), lambda g: inverse @ g, 1e9)
+        at = descent._blank(jnp.zeros(size))
         at = at._replace(
+            gradient=jnp.asarray(gradient),
             moves=at.moves.at[rows].set(moves),
             turns=at.turns.at[rows].set(turns),
             products=at.products.at[np.ix_(rows, rows)].set(moves @ turns.T),
@@ -121,7 +122,7 @@ def test_steps_beyond_the_memory_go_as_those_of_two_loops():
     with jax.enable_x64(True):
         settings = (objective, lambda g: jnp.asarray(inverse) @ g, 3.0)
         step = jax.jit(lambda at: descent._step(at, *settings))
-        at = descent._first(jnp.asarray(3.0 * random.normal(size=size)), *settings)
+        at = step(descent._blank(jnp.asarray(3.0 * random.normal(size=size))))
         for _ in range(2 * descent.MEMORY + 9):
             last, at = at, step(at)
             if at.energy == last.energy:
