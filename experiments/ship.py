@@ -34,7 +34,7 @@ def main(argv: list[str]) -> None:
         packed = run / "packed" / arguments.name
         size = trained.pack(run, packed)
         print(f"{packed}: {size / 1e6:.2f} MB of weights")
-        config, _ = trained.phi(packed)
+        config = trained.configured(packed)
         seconds = sum(sum(read_seconds(run / stage)) for stage in trained.STAGES) + sum(add_seconds(run).values())
         about = {
             # the configuration is complete: it trains the same again

@@ -37,7 +37,7 @@ class Job(submitit.helpers.Checkpointable):
         run = Path(directory)
         report = run / "evaluation.json"
         if report.exists():
-            if trained.network(run)[0] != _configured(arguments, directory):
+            if trained.configured(run) != _configured(arguments, directory):
                 raise ValueError(f"{run} was trained with other settings: give another --directory, or remove it")
         else:
             train.main([*arguments, "--directory", directory])

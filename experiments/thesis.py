@@ -115,7 +115,7 @@ def finished(run: Path, config: Config | None = None) -> bool:
     stages = [stage for stage in trained.STAGES if checkpoint.steps(run / stage / "checkpoints")]
     if not stages:
         return False
-    there = trained.network(run)[0]
+    there = trained.configured(run)
     config = config or there
     differing = [name for name in TRAINED if getattr(there, name) != getattr(config, name)]
     if differing:
@@ -149,7 +149,7 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
         for run in shown.values():
             measured = measures(run)
             figures[garment] |= {name: values for name, values in measured.items() if name != "lbs"}
-            config = trained.network(run)[0]
+            config = trained.configured(run)
             motion = config.evaluation.motions[0]
             saved = Tracks.load(run, motion)
             tracks |= {name: track for name, track in saved.stages.items() if name != "lbs"}
@@ -169,7 +169,7 @@ def shapes(runs: Runs) -> tuple[dict, Section]:
     parts = []
     for garment, of_it in runs.items():
         if "ours" in of_it:
-            config = trained.phi(of_it["ours"])[0]
+            config = trained.configured(of_it["ours"])
             parts.append(
                 f"<h3>{garment}</h3>" + sheet(*pictures.gallery(of_it["ours"], config.evaluation.motions[:1], FRAME))
             )
@@ -185,7 +185,7 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
     figures, tracks = {}, {}
     for key, stage in (("ours", "psi"), ("direct", "direct")):
         figures[stage] = measures(of_it[key])[stage]
-        config = trained.network(of_it[key])[0]
+        config = trained.configured(of_it[key])
         motion = config.evaluation.motions[0]
         saved = Tracks.load(of_it[key], motion)
         tracks |= {stage: saved.stages[stage], "solver": saved.solver}

@@ -60,7 +60,7 @@ def main(argv: list[str]) -> None:
     options = Options(**{name: getattr(arguments, name) for name in Options._fields})
     formats.check(arguments.to, options)
     run = trained.find(arguments.model)
-    count = storage.load_body(trained.psi(run).config.body).shapedirs.shape[-1]
+    count = storage.load_body(trained.configured(run).body).shapedirs.shape[-1]
     betas = cli.betas(arguments.betas, count)
     material = None if arguments.material is None else Material(*arguments.material)
     model = loading.load(run, betas=betas, material=material, coarse=arguments.coarse)

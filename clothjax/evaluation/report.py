@@ -63,7 +63,7 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, 
     for name, folder in folders.items():
         present = motions
         if present is None:
-            wanted = trained.network(folder)[0].evaluation.motions
+            wanted = trained.configured(folder).evaluation.motions
             present = [motion for motion in wanted if storage.asset(motion).is_file()]
             absent = set(wanted) - set(present)
             print(f"{name}: on {', '.join(present)}", *(f"({motion} is not here)" for motion in absent))

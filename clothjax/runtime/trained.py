@@ -89,7 +89,7 @@ def network(run: str | Path) -> tuple[Config, dict]:
         config, parts = _unpack(Path(run))
         params, statistics = parts["phi"], parts["statistics"]
     else:
-        config = _config(Path(run))
+        config = configured(run)
         wanted = ("average",) if config.peer.network else ("average", "statistics")
         parts, _ = checkpoint.read(Path(run) / "stage1" / "checkpoints", *wanted)
         params, statistics = parts["average"], _statistics(parts.get("statistics", {}))
@@ -107,7 +107,7 @@ def psi(run: str | Path) -> TrainedPsi:
     if packed(run):
         config, parts = _unpack(Path(run))
         garment, predictor, normalizers = parts["phi"]["garment"], parts["predictor"], parts["normalizers"]
-    elif (config := _config(Path(run))).peer.network:
+    elif (config := configured(run)).peer.network:
         if config.peer.network != "direct":
             raise ValueError(f"{run}: is of {config.peer.network}, which has no latent predictor to use")
         params = network(run)[1]["params"]
@@ -119,13 +119,26 @@ def psi(run: str | Path) -> TrainedPsi:
     else:
         directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
         parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
-        config = _config(Path(run))
+        config = configured(run)
         garment, predictor = parts["garment"], parts["average"]
         for trained_on in later:
             if checkpoint.steps(trained_on):
                 predictor = checkpoint.read(trained_on, "average")[0]["average"]
         normalizers = _normalizers(parts["normalizers"])
     return TrainedPsi(config, garment, predictor, normalizers)
+
+
+def configured(run: str | Path) -> Config:
+    """Load the configuration of a run's last stage, or of a packed model, and nothing of its networks.
+
+    Raises:
+        ValueError: if there is no readable one.
+    """
+    if packed(run):
+        return configuration.load(Config, Path(run) / CONFIG, stored=True)
+    first, *later = (Path(run) / stage / "checkpoints" for stage in STAGES)  # settings may differ in earlier ones
+    last = [first, *(folder for folder in later if checkpoint.steps(folder))][-1]
+    return configuration.from_dict(Config, checkpoint.latest(last).config, str(last), stored=True)
 
 
 def packed(run: str | Path) -> bool:
@@ -253,16 +266,8 @@ def _normalizers(parts: dict[str, Any]) -> Normalizers | ForceScales:
     return Normalizers(*(Scale(**parts[name]) for name in Normalizers._fields))
 
 
-def _config(run: Path) -> Config:
-    """Load the configuration of a run's last stage; earlier ones may hold other settings of later stages."""
-    first, *later = (run / stage / "checkpoints" for stage in STAGES)
-    last = [first, *(folder for folder in later if checkpoint.steps(folder))][-1]
-    return configuration.from_dict(Config, checkpoint.latest(last).config, str(last), stored=True)
-
-
 def _unpack(directory: Path) -> tuple[Config, dict[str, Any]]:
-    config = configuration.load(Config, directory / CONFIG, stored=True)
-    path = directory / WEIGHTS
+    config, path = configured(directory), directory / WEIGHTS
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a damaged one open
             number = int(file["format"]) if "format" in file.files else 1

@@ -58,7 +58,7 @@ def measure(
     """
     garments: dict[str, list[Path]] = {}
     for run in dict.fromkeys(runs):
-        garments.setdefault(trained.network(run)[0].garment, []).append(run)
+        garments.setdefault(trained.configured(run).garment, []).append(run)
     cases = [prepare(of_it, motions, frames) for of_it in garments.values()]
     points = []
     with progress_bar("garments", len(garments)) as report, tempfile.TemporaryDirectory() as folder:

@@ -60,7 +60,7 @@ class Case(NamedTuple):
 
 def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
     """Prepare the case of a garment's runs: the character and the motions of the first run's evaluation."""
-    configs = [trained.network(run)[0] for run in runs]
+    configs = [trained.configured(run) for run in runs]
     first = configs[0]
     wearers = [(c.stage1.betas, c.evaluation.betas, c.evaluation.betas_seed) for c in configs]
     for run, config, wearer in zip(runs, configs, wearers, strict=True):
@@ -93,7 +93,7 @@ def every(
     """Return the variants of one garment by run and name, and the solver's own loops."""
     variants = {("", "skinning"): _skinning(case, folder)}
     for run in runs:
-        network = trained.network(run)[0].peer.network
+        network = trained.configured(run).peer.network
         if network in ("ncs", "snug"):
             of_run = _baseline(case, run, folder, shapes)
         else:

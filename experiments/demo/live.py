@@ -205,7 +205,7 @@ class Show:
         fine: bool = False,
     ) -> None:
         """Change the garment, body or number of characters; `betas` may be the first few of the body's."""
-        config = trained.psi(run).config
+        config = trained.configured(run)
         if config.fps != self.player.clips.fps:
             raise ValueError(f"the clips are at {self.player.clips.fps} frames a second, {run} at {config.fps}")
         self._pose_body, body = _body(config.body)

@@ -254,7 +254,7 @@ def start(arguments: argparse.Namespace) -> Viewer:
     if garment not in garments:  # a folder stands alone: its body may be another
         folder = trained.find(garment)
         garments, garment = {folder.name: folder}, folder.name
-    config = trained.psi(garments[garment]).config
+    config = trained.configured(garments[garment])
     body, names = storage.load_rig(config.body)
     motions = clips(arguments.motions, names)
     library = motion_matching.library(motions, np.asarray(body.joints), body.parents, names)
