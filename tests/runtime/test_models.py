@@ -22,6 +22,7 @@ def test_these_garments_come_with_the_library():
         "pants",
         "pants_fine",
         "skirt",
+        "skirt_fine",
         "tshirt",
         "tshirt_fine",
         "tshirt_pose",
