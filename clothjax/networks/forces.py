@@ -91,8 +91,10 @@ def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConf
     """
 
     def force(names: tuple[str, ...]) -> Array:
+        others = {name for kind in KINDS.values() for name in kind}.difference(names)
+
         def energy(new: Array) -> Array:
-            terms = incremental_potential.energies(new, step, mesh, config, LAWS)
+            terms = incremental_potential.energies(new, step, mesh, config, LAWS, others)
             return sum((terms[name] for name in names if name in terms), jnp.zeros(()))
 
         return -jax.grad(energy)(position)

@@ -1,6 +1,6 @@
 """The incremental potential of one time step (METHOD.md, Incremental potential): its energies, and their plain sum."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -57,45 +57,64 @@ def pushed(velocity: Float[Array, "V 3"], timestep: Scalar, external: Array | No
 
 
 def elements(
-    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
+    new: Float[Array, "V 3"],
+    step: TimeStep,
+    mesh: Mesh,
+    config: PhysicsConfig,
+    laws: Laws = LAWS,
+    without: Collection[str] = (),
 ) -> dict[str, Array]:
     """Evaluate every term of the incremental potential at new positions [V, 3] m, element by element, in J.
 
     Training and the reference solver both minimise the sum of these; there is no other energy.
+
+    Args:
+        without: terms that are left out, beside those of the configuration.
     """
     moved = new - step.position
-    contact = step.contact
-    terms = {
-        "stretching": laws.stretching(
+    terms: dict[str, Callable[[], Array]] = {
+        "stretching": lambda: laws.stretching(
             at_corners(new, mesh.faces), step.rest.inverse, step.rest.face_area, step.material.mu, step.material.lam
         ),
-        "bending": bending(
+        "bending": lambda: bending(
             at_corners(new, mesh.hinges), step.rest.hinge_area, step.rest.hinge_angle, step.material.bending
         ),
         # the height gained in the step: the same force as the height, without its large constant
-        "gravity": gravity(moved[:, 1], step.mass),
-        "inertia": inertia(moved - step.velocity, step.mass, step.timestep),
+        "gravity": lambda: gravity(moved[:, 1], step.mass),
+        "inertia": lambda: inertia(moved - step.velocity, step.mass, step.timestep),
     }
-    if contact is not None:
-        gap = contact_search.distance(new, contact.point_next, contact.normal_next)
-        terms["collision"] = config.collision_stiffness * laws.collision(gap, config.collision_offset)
-    if contact is not None and step.touching is not None:
-        normal = contact.normal + contact.normal_next
-        length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
-        terms["friction"] = friction(
-            moved - (contact.point_next - contact.point),
-            normal / length,
-            step.mass,
-            step.touching,
-            config.friction_coefficient,
-            FRICTION_SMOOTHING,
-        )
-    if step.edge_contact is not None:
-        terms["edge_collision"] = edge_collision(at_corners(new, mesh.edges), step.edge_contact, config, laws)
-    if step.self_contact is not None:
-        points = jnp.concatenate([new[:, None], new[step.self_contact.corners]], axis=1)
-        terms["self_collision"] = self_collision(points, step.self_contact, config, laws)
-    return {name: values for name, values in terms.items() if name not in config.without}
+    if (contact := step.contact) is not None:
+        terms["collision"] = lambda: collisions(new, contact, config, laws)
+    if contact is not None and (touching := step.touching) is not None:
+        terms["friction"] = lambda: frictions(moved, contact, step.mass, touching, config)
+    if (edges := step.edge_contact) is not None:
+        terms["edge_collision"] = lambda: edge_collision(at_corners(new, mesh.edges), edges, config, laws)
+    if (itself := step.self_contact) is not None:
+        points = jnp.concatenate([new[:, None], new[itself.corners]], axis=1)
+        terms["self_collision"] = lambda: self_collision(points, itself, config, laws)
+    return {name: term() for name, term in terms.items() if name not in {*config.without, *without}}
+
+
+def collisions(
+    new: Float[Array, "V 3"], contact: Contact, config: PhysicsConfig, laws: Laws = LAWS
+) -> Float[Array, " V"]:
+    """Collision energy [V] J of vertices [V, 3] m with their planes."""
+    gap = contact_search.distance(new, contact.point_next, contact.normal_next)
+    return config.collision_stiffness * laws.collision(gap, config.collision_offset)
+
+
+def frictions(
+    moved: Float[Array, "V 3"],
+    contact: Contact,
+    mass: Float[Array, " V"],
+    touching: Bool[Array, " V"],
+    config: PhysicsConfig,
+) -> Float[Array, " V"]:
+    """Friction energy [V] J of vertices that moved by [V, 3] m in a step, of those that were touching their planes."""
+    normal = contact.normal + contact.normal_next
+    length = jnp.sqrt(jnp.maximum(jnp.sum(normal * normal, axis=-1, keepdims=True), 1e-12))
+    slid = moved - (contact.point_next - contact.point)
+    return friction(slid, normal / length, mass, touching, config.friction_coefficient, FRICTION_SMOOTHING)
 
 
 def edge_collision(
@@ -123,10 +142,15 @@ def self_collision(
 
 
 def energies(
-    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
+    new: Float[Array, "V 3"],
+    step: TimeStep,
+    mesh: Mesh,
+    config: PhysicsConfig,
+    laws: Laws = LAWS,
+    without: Collection[str] = (),
 ) -> dict[str, Array]:
-    """Evaluate the terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
-    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws).items()}
+    """Evaluate the terms of the incremental potential, as `elements`, each a scalar in J."""
+    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws, without).items()}
 
 
 def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Float[Array, ""]:
@@ -134,10 +158,9 @@ def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: Phys
 
     A time step of the cloth minimises it.
     """
-    terms = energies(new, step, mesh, config)
-    if kernels.used(new):
-        terms |= {name: energy for name, energy in _in_kernels(new, step, mesh, config).items() if name in terms}
-    return sum(terms.values())  # pyright: ignore[reportReturnType]  # there are terms
+    compiled = _in_kernels(new, step, mesh, config) if kernels.used(new) else {}
+    terms = energies(new, step, mesh, config, without=compiled)
+    return sum((terms | compiled).values())  # pyright: ignore[reportReturnType]  # there are terms
 
 
 def _in_kernels(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
@@ -149,4 +172,4 @@ def _in_kernels(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -
     if step.edge_contact is not None:
         stiffness, offset = config.collision_stiffness, config.collision_offset
         terms["edge_collision"] = kernels.edge_collision(new, step.edge_contact, mesh, stiffness, offset)
-    return terms
+    return {name: energy for name, energy in terms.items() if name not in config.without}

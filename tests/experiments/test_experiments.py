@@ -79,7 +79,7 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
     assert 0 < report["evaluation"]["phi"]["span_gap"] and "span_gap" not in report["evaluation"]["psi"]
     assert "penetration_by_joint" in report["motions"]["walk_3"]["lbs"]
     assert report["quickstart"]["train_seconds"] > 0
-    assert report["quickstart"]["onnx_error_mm"] < 0.1
+    assert report["quickstart"]["onnx_error_mm"] < 0.001
     assert "hold_gap" in (finished / "report.md").read_text()
     assert picture(finished / "comparison.png").width > 1000
     assert picture(finished / "walk.webp").frames == 6

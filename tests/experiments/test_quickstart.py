@@ -23,7 +23,7 @@ def test_the_quickstart_meets_its_bars(report):
     assert psi["hold_gap"] <= 0.6
     assert psi["penetration_percent"] <= 1.0
     assert psi["finite"] is True
-    assert report["quickstart"]["onnx_error_mm"] <= 0.1
+    assert report["quickstart"]["onnx_error_mm"] <= 0.001
 
 
 @pytest.mark.slow
