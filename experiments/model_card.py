@@ -111,10 +111,10 @@ def _cloth(config: Config) -> str:
 
 def _figures(report: dict) -> list[str]:
     """Return the section of measures, means over motions."""
-    stages = [stage for stage in METHODS if stage in report]
-    rows = [f"| | {' | '.join(METHODS[stage] for stage in stages)} |", "|---" * (len(stages) + 1) + "|"]
+    methods = [method for method in METHODS if method in report]
+    rows = [f"| | {' | '.join(METHODS[method] for method in methods)} |", "|---" * (len(methods) + 1) + "|"]
     for key, meaning in MEASURES.items():
-        rows.append(f"| {meaning} | {' | '.join(_figure(report[stage].get(key)) for stage in stages)} |")
+        rows.append(f"| {meaning} | {' | '.join(_figure(report[method].get(key)) for method in methods)} |")
     names = ", ".join(f"`{name.removesuffix('.motion')}`" for name in report["motions"])
     return [
         "## How good it is",

@@ -129,7 +129,7 @@ def finished(run: Path, config: Config | None = None) -> bool:
 
 @functools.cache
 def measures(run: Path) -> dict[str, dict[str, float]]:
-    """Return the measures of each stage of a run, the same as `clothjax evaluate`."""
+    """Return the measures of each method of a run, the same as `clothjax evaluate`."""
     return evaluate(run)["evaluation"]
 
 
@@ -152,7 +152,7 @@ def appearance(runs: Runs) -> tuple[dict, Section]:
             config = trained.configured(run)
             motion = config.evaluation.motions[0]
             saved = Tracks.load(run, motion)
-            tracks |= {name: track for name, track in saved.stages.items() if name != "lbs"}
+            tracks |= {name: track for name, track in saved.methods.items() if name != "lbs"}
             solver = saved.solver
         experiment = assembly.assemble(config)
         rows, columns = pictures.at_moments(experiment, motion, tracks | {"solver": solver}, MOMENTS)
@@ -183,12 +183,12 @@ def ablation(runs: Runs) -> tuple[dict, Section]:
     if not {"ours", "direct"} <= set(of_it):
         return {}, (title, f"<p>Needs both runs of the {ABLATION}.</p>")
     figures, tracks = {}, {}
-    for key, stage in (("ours", "psi"), ("direct", "direct")):
-        figures[stage] = measures(of_it[key])[stage]
+    for key, method in (("ours", "psi"), ("direct", "direct")):
+        figures[method] = measures(of_it[key])[method]
         config = trained.configured(of_it[key])
         motion = config.evaluation.motions[0]
         saved = Tracks.load(of_it[key], motion)
-        tracks |= {stage: saved.stages[stage], "solver": saved.solver}
+        tracks |= {method: saved.methods[method], "solver": saved.solver}
     rows, columns = pictures.at_moments(assembly.assemble(config), motion, tracks, MOMENTS)
     text = "<p>Predictor, decoder and blend shapes trained on the losses alone, for the same time.</p>"
     return figures, (title, text + table(figures, MEASURES) + sheet(rows, columns))

@@ -90,7 +90,7 @@ def perform_beside(run: Path, experiment: Experiment, motion: str, frames: int) 
     """
     tracks, clip = Tracks.load(run, motion), assembly.motion(experiment, motion)
     frames = min(frames, len(tracks.solver))
-    both = {"Psi": tracks.stages["psi"], "reference solver": tracks.solver}
+    both = {"Psi": tracks.methods["psi"], "reference solver": tracks.solver}
     return {name: _performance(experiment, clip, track[:frames]) for name, track in both.items()}
 
 
@@ -198,7 +198,7 @@ def write_comparison(run: Path, experiment: Experiment, motion: str, out: Path) 
         ValueError: if `clothjax evaluate` has not measured the run on this clip.
     """
     tracks = Tracks.load(run, motion)
-    shown = {label: tracks.stages[name] for name, label in ROWS.items()} | {"reference solver": tracks.solver}
+    shown = {label: tracks.methods[name] for name, label in ROWS.items()} | {"reference solver": tracks.solver}
     rows, columns = at_moments(experiment, motion, shown)
     ray_cast.comparison(out, rows, columns)
 

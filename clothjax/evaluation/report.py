@@ -71,9 +71,9 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, 
     for folder in folders.values():  # not before all of them are measured
         _forget(folder)
     first, *others = (report["evaluation"] for report in reports.values())
-    stages = [stage for stage in first if all(stage in other for other in others)]  # a baseline has others
+    methods = [method for method in first if all(method in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
-    return {"mean": {stage: _mean([each[stage] for each in flat.values()]) for stage in stages}} | flat
+    return {"mean": {method: _mean([each[method] for each in flat.values()]) for method in methods}} | flat
 
 
 def evaluate(
@@ -125,7 +125,8 @@ def _evaluated(
     long = found[over_long]
     return {
         "evaluation": {
-            stage: _mean([one[stage] for one in by_motion.values()]) | long.get(stage, {}) for stage in measured.stages
+            method: _mean([one[method] for one in by_motion.values()]) | long.get(method, {})
+            for method in measured.methods
         },
         "motions": by_motion,
         "wearers": {wearer: found[part] for wearer, part in worn.items()},
@@ -138,16 +139,16 @@ def _evaluated(
 
 # a method to measure: for a character and a clip it compiles a function that returns the garment's trajectory
 # [T - 2, V, 3] m, relative to the root
-Stage = Callable[[Character, Motion], Callable[[], np.ndarray]]
+Method = Callable[[Character, Motion], Callable[[], np.ndarray]]
 
 
 class Measured(NamedTuple):
-    """What is measured: a run, its experiment and character, and its stages by name."""
+    """What is measured: a run, its experiment and character, and its methods by name."""
 
     run: Path
     experiment: Experiment
     character: Character
-    stages: dict[str, Stage]
+    methods: dict[str, Method]
     blendshapes: np.ndarray | None  # of Phi, [K, V, 3] m; None where there is no Phi
 
     @classmethod
@@ -157,7 +158,7 @@ class Measured(NamedTuple):
         config = experiment.config
         character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
         shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-        return cls(run, experiment, character, _stages(experiment, model, run), shapes)
+        return cls(run, experiment, character, _methods(experiment, model, run), shapes)
 
 
 def _parts_file(run: Path) -> Path:
@@ -171,22 +172,21 @@ def _forget(run: Path) -> None:
 
 def _fingerprint(measured: Measured) -> int:
     """Return a number that tells evaluations of other models, or with other settings, apart."""
-    run, experiment, _, stages, _ = measured
-    models = [trained.network(run)[1], *(trained.psi(run)[1:] if "psi" in stages else ())]
-    return run_folder.fingerprint(configuration.to_dict(experiment.config), jax.tree.leaves(models))
+    settings = configuration.to_dict(measured.experiment.config)
+    return run_folder.fingerprint(settings, [np.asarray(rollouts.networks(measured.run))])
 
 
 def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
     """Measure all methods on one motion, by name, and save their trajectories."""
-    run, experiment, character, stages, shapes = measured
+    run, experiment, character, methods, shapes = measured
     clip = assembly.evaluation_motion(experiment, name)
-    tracks, converged = simulate(experiment, stages, character, clip)
+    tracks, converged = simulate(experiment, methods, character, clip)
     tracks.save(run, name)
     return measure(experiment, character, clip, tracks, converged, shapes)
 
 
-def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
-    """Return the stages to measure, by name, of what `load_run` gave."""
+def _methods(experiment: Experiment, model: dict, run: Path) -> dict[str, Method]:
+    """Return the methods to measure, by name, of what `load_run` gave."""
     config = experiment.config
     baseline = config.peer.network
     joints = input_joints(experiment.names, config.stage2)
@@ -213,19 +213,19 @@ def _stages(experiment: Experiment, model: dict, run: Path) -> dict[str, Stage]:
 
 
 def simulate(
-    experiment: Experiment, stages: dict[str, Stage], character: Character, clip: Motion
+    experiment: Experiment, methods: dict[str, Method], character: Character, clip: Motion
 ) -> tuple[Tracks, float]:
     """Roll out every method, and the reference solver over the first `evaluation.solver_frames` frames.
 
     Args:
-        stages: the methods, by name.
+        methods: the methods, by name.
 
     Returns:
         The trajectories, and the share of the solver's frames that converged.
     """
     poses = windows(clip)
     frames = poses.translation.shape[0]
-    tracks = {name: stage(character, clip)() for name, stage in stages.items()}
+    tracks = {name: method(character, clip)() for name, method in methods.items()}
     start = jax.tree.map(lambda x: x[: experiment.config.evaluation.solver_frames], poses)
     solved, infos = reference.simulate(experiment.scene, character, start, experiment.config)
     solved = solved[:frames]  # of a shorter clip, the solver simulates one frame more
@@ -255,8 +255,8 @@ def measure(
     sampled = np.unique(np.linspace(SETTLING_FRAMES, frames - 2, settings.gap_frames).astype(int))
     strain = metrics.edge_strain(scene, character, solved[late])
     result = {"solver": {"frames": solver_frames, "converged": converged, **strain}}
-    for stage, track in tracks.stages.items():
-        span = blendshapes if stage == "phi" else None
+    for method, track in tracks.methods.items():
+        span = blendshapes if method == "phi" else None
         steps = metrics.step_measures(scene, character, jnp.asarray(track), poses, sampled, experiment.config, span)
         measured = metrics.gaps(steps)
         if scene.touchable:
@@ -264,26 +264,26 @@ def measure(
             measured |= metrics.penetrations(body, character.betas, track, poses, every_fourth, experiment.names)
         measured |= metrics.edge_strain(scene, character, track[late])
         measured["edge_strain_ratio"] = measured["edge_strain_p95"] / strain["edge_strain_p95"]
-        measured |= metrics.beside_solver(scene, track[common], solved[common], tracks.stages["lbs"][common])
+        measured |= metrics.beside_solver(scene, track[common], solved[common], tracks.methods["lbs"][common])
         measured["jitter"] = metrics.roughness(track[common], advance) / roughness
-        result[stage] = measured
+        result[method] = measured
     return result
 
 
 def measure_wearer(measured: Measured, name: str, wearer: str) -> dict[str, dict]:
     """Measure the gaps of all methods but skinning on one of nine characters, over the start of a motion."""
-    experiment, stages = measured.experiment, measured.stages
+    experiment, methods = measured.experiment, measured.methods
     config, clip = experiment.config, assembly.motion(experiment, name)
     clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
     poses = windows(clip)
     sampled = np.linspace(SETTLING_FRAMES, len(clip.translation) - 4, CHARACTERS_GAPS).astype(int)
     character = assembly.dress(experiment, *assembly.wearers(experiment)[wearer])
     return {
-        stage: metrics.gaps(
+        method: metrics.gaps(
             metrics.step_measures(experiment.scene, character, make(character, clip)(), poses, sampled, config)
         )
-        for stage, make in stages.items()
-        if stage != "lbs"
+        for method, make in methods.items()
+        if method != "lbs"
     }
 
 
@@ -308,14 +308,14 @@ def measure_push(measured: Measured, name: str, push: str) -> dict[str, float]:
 
 def measure_long(measured: Measured, name: str) -> dict[str, dict]:
     """Measure all methods but skinning over the long rollout on a motion, with their times, and Psi against Phi."""
-    _, experiment, character, stages, _ = measured
+    _, experiment, character, methods, _ = measured
     clip = assembly.motion(experiment, name)
     clip = assembly.there_and_back(clip, experiment.config.evaluation.long_frames + 2)
     tracks, result = {}, {}
-    for name in stages:
+    for name in methods:
         if name == "lbs":
             continue
-        run = stages[name](character, clip)
+        run = methods[name](character, clip)
         started = time.perf_counter()
         track = tracks[name] = run()
         seconds = time.perf_counter() - started
@@ -332,11 +332,11 @@ def measure_long(measured: Measured, name: str) -> dict[str, dict]:
     return result
 
 
-def table(stages: dict) -> str:
+def table(methods: dict) -> str:
     """Format measures as a Markdown table: a row for each measure, a column for each method."""
-    rows = [f"| | {' | '.join(stages)} |", "|---" * (len(stages) + 1) + "|"]
-    for name in dict.fromkeys(key for measured in stages.values() for key in measured):
-        cells = (_cell(measured.get(name)) for measured in stages.values())
+    rows = [f"| | {' | '.join(methods)} |", "|---" * (len(methods) + 1) + "|"]
+    for name in dict.fromkeys(key for measured in methods.values() for key in measured):
+        cells = (_cell(measured.get(name)) for measured in methods.values())
         rows.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(rows)
 

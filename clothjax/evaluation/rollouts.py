@@ -17,6 +17,7 @@ from clothjax.runtime.models import Model
 from clothjax.simulation import assembly, characters, rollout
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
+from clothjax.training import run_folder
 from clothjax.types import Array, Motion, Pose
 
 SETTLING_FRAMES = 5  # frames left out of averages over time: methods start otherwise, from skinning or at rest
@@ -25,27 +26,36 @@ SETTLING_FRAMES = 5  # frames left out of averages over time: methods start othe
 class Tracks(NamedTuple):
     """Trajectories [T - 2, V, 3] m of a garment over a motion, relative to the root."""
 
-    stages: dict[str, np.ndarray]  # of each method, by its name: `lbs`, `phi`, `psi` or a baseline's
+    methods: dict[str, np.ndarray]  # of each method, by its name: `lbs`, `phi`, `psi` or a baseline's
     solver: np.ndarray  # of the reference solver; of a long motion, its start
 
     def save(self, run: Path, motion: str) -> None:
         """Save the trajectories in a run's folder, for pictures."""
-        arrays: dict[str, Any] = {name: np.asarray(track, np.float32) for name, track in self.stages.items()}
-        np.savez_compressed(_tracks_path(run, motion), **arrays, solver=self.solver)
+        arrays: dict[str, Any] = {name: np.asarray(track, np.float32) for name, track in self.methods.items()}
+        np.savez_compressed(_tracks_path(run, motion), **arrays, solver=self.solver, networks=networks(run))
 
     @classmethod
     def load(cls, run: Path, motion: str) -> "Tracks":
         """Load the trajectories that `save` wrote.
 
         Raises:
-            ValueError: if there are none.
+            ValueError: if there are none, or the run has been trained since.
         """
-        path = _tracks_path(run, motion)
+        path, first = _tracks_path(run, motion), f"run `python -m clothjax evaluate {run} --motions {motion}` first"
         if not path.is_file():
-            raise ValueError(f"{path}: no such file; run `python -m clothjax evaluate {run} --motions {motion}` first")
+            raise ValueError(f"{path}: no such file; {first}")
         with np.load(path) as file:
-            stages = {name: file[name] for name in file.files if name != "solver"}
-            return cls(stages, file["solver"])
+            arrays = {name: file[name] for name in file.files}
+        if arrays.pop("networks", None) != networks(run):
+            raise ValueError(f"{path}: is of other networks than {run} has now; {first}")
+        solver = arrays.pop("solver")
+        return cls(arrays, solver)
+
+
+def networks(run: Path) -> int:
+    """Return a number that tells the networks of runs apart."""
+    config, model = trained.network(run)
+    return run_folder.fingerprint({}, jax.tree.leaves([model, *(() if config.peer.network else trained.psi(run)[1:])]))
 
 
 def output_folder(run: Path) -> Path:

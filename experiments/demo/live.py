@@ -1,4 +1,4 @@
-"""A steered character, frame by frame: its garment by Psi, and by the stages that Psi is compared with."""
+"""A steered character, frame by frame: its garment by Psi, and by the methods that Psi is compared with."""
 
 import time
 from collections import deque
@@ -23,14 +23,14 @@ from clothjax.types import Material, Pose
 
 SPEEDS = (0.0, 1.3, 2.8)  # m/s: stand, walk, run
 TURN = np.radians(45.0)
-STAGES = ("psi", "skinning", "phi", "solver")
-APART = 1.4  # m, from one stage to the next, and from one character of a crowd to the next
+METHODS = ("psi", "skinning", "phi", "solver")
+APART = 1.4  # m, from one method to the next, and from one character of a crowd to the next
 BEHIND = 11  # frames that a character of a crowd is behind the one before it
 BODIES = 4  # that are shown, of a crowd
 
 
 class Outfit:
-    """A garment on a character, moved by each of the stages.
+    """A garment on a character, moved by each of the methods.
 
     Args:
         run: the folder of a run or of a packed model.
@@ -57,9 +57,9 @@ class Outfit:
     def _character(self) -> characters.Character:
         return self._comparison.dress(self._betas, self._material)
 
-    def mesh(self, stage: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the faces [F, 3] and the vertices [V, 3] m at rest of the mesh that a stage shows."""
-        if stage == "psi":
+    def mesh(self, method: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the faces [F, 3] and the vertices [V, 3] m at rest of the mesh that a method shows."""
+        if method == "psi":
             return np.asarray(self.model.faces), np.asarray(self.model.wearer.template).T
         return self._comparison.faces, np.asarray(self._character.template)
 
@@ -81,17 +81,18 @@ class Outfit:
         self._states, vertices = inference.step_crowd(self._crowd, self._states, together, external)
         return np.asarray(vertices)
 
-    def beside(self, stages: list[str], window: Pose) -> dict[str, np.ndarray]:
-        """Return vertices [V, 3] m of the next frame of the first character, by other stages.
+    def beside(self, methods: list[str], window: Pose) -> dict[str, np.ndarray]:
+        """Return vertices [V, 3] m of the next frame of the first character, by other methods.
 
         Args:
-            stages: a stage that was left out for a frame restarts from the skinned garment.
+            methods: a method that was left out for a frame restarts from the skinned garment.
             window: its last three poses.
         """
         self._beside = {
-            stage: self._comparison.step(stage, self._character, self._beside.get(stage), window) for stage in stages
+            method: self._comparison.step(method, self._character, self._beside.get(method), window)
+            for method in methods
         }
-        return {stage: vertices for stage, (_, vertices) in self._beside.items()}
+        return {method: vertices for method, (_, vertices) in self._beside.items()}
 
 
 def finer(config: Config) -> str | None:
@@ -106,7 +107,7 @@ def _comparison(run: Path) -> "Comparison":
 
 
 class Comparison:
-    """The stages beside Psi, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
+    """The methods beside Psi, frame by frame: skinning, Phi and the solver, on the mesh of the training."""
 
     def __init__(self, run: Path):
         self.config, model = trained.phi(run)
@@ -133,19 +134,19 @@ class Comparison:
         material = Material(*(jnp.asarray(value, jnp.float32) for value in material))
         return characters.dress(self.scene, jnp.asarray(betas, jnp.float32), material, self.config.physics)
 
-    def step(self, stage: str, character, before: tuple | None, window: Pose) -> tuple:
-        """Return a stage's next state, and its next vertices [V, 3] m in the world.
+    def step(self, method: str, character, before: tuple | None, window: Pose) -> tuple:
+        """Return a method's next state, and its next vertices [V, 3] m in the world.
 
         Args:
-            before: the stage's state; None to begin.
+            before: the method's state; None to begin.
             window: the last three poses.
         """
         here = window.translation[1]
         poses = Pose(jnp.asarray(window.rotations), jnp.asarray(window.translation - here[None]))
         state = None if before is None else before[0]
-        if stage == "skinning":
+        if method == "skinning":
             return None, np.asarray(self._skinned(character, poses)) + here
-        if stage == "phi":
+        if method == "phi":
             state, new = self._take(character, self._settle(character, poses) if state is None else state, poses)
             return state, np.asarray(new) + here
         last, now = [np.asarray(self._settle(character, poses).position)] * 2 if state is None else state
@@ -190,7 +191,7 @@ class Show:
 
     def __init__(self, clips: Library, wander: tuple[str, ...], run: Path):
         self.steering, self.player = Steering(), Player(clips, wander)
-        self.stages: tuple[str, ...] = ("psi",)
+        self.methods: tuple[str, ...] = ("psi",)
         self.past: deque[Pose] = deque()
         self.seconds = {"psi": 0.0, "pose": 0.0}
         self.frames = 0
@@ -220,7 +221,7 @@ class Show:
         self.past = deque(self.past, maxlen=max(3, BEHIND * (count - 1) + 1))
 
     def frame(self) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
-        """Return the next frame: vertices [N, V, 3] m by stage, in their places, and vertices [B, 3] m of bodies."""
+        """Return the next frame: vertices [N, V, 3] m by method, in their places, and vertices [B, 3] m of bodies."""
         began = time.perf_counter()
         steering = self.steering
         family = steering.doing if self.frames < steering.until else None
@@ -239,12 +240,12 @@ class Show:
         self.seconds = {"psi": time.perf_counter() - paused, "pose": paused - began}
         newest = [self.past[max(len(self.past) - 3 + i, 0)] for i in range(3)]
         window = Pose(*(np.stack(each) for each in zip(*newest, strict=True)))
-        others = [stage for stage in self.stages if stage != "psi"]
-        for i, (stage, vertices) in enumerate(self.outfit.beside(others, window).items()):
+        others = [method for method in self.methods if method != "psi"]
+        for i, (method, vertices) in enumerate(self.outfit.beside(others, window).items()):
             aside = np.array([APART * (i + 1), 0.0, 0.0], np.float32)
-            shown[stage] = (vertices + aside)[None]
+            shown[method] = (vertices + aside)[None]
             bodies.append(np.asarray(self._pose_body(*self._shape, pose)) + aside)
-        return {stage: shown[stage] for stage in self.stages}, bodies
+        return {method: shown[method] for method in self.methods}, bodies
 
 
 @cache

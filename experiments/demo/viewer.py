@@ -6,7 +6,7 @@
 
 Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the
 arrows are the viewer's own, for its camera. The panel repeats the keys and chooses garment, body and cloth, wind for
-the skirt, and the stages beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
+the skirt, and the methods beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from clothjax.files import storage
 from clothjax.material import scaled, unscaled
 from clothjax.runtime import trained
 from clothjax.types import Material, Motion
-from experiments.demo.live import APART, STAGES, TURN, Show, finer, strain
+from experiments.demo.live import APART, METHODS, TURN, Show, finer, strain
 
 CLIPS = tuple(f"{family}_{i}" for family in ("walk", "run", "arms", "jump", "twist", "dance") for i in range(4))
 WANDER = ("walk", "run", "arms")  # families that are for going about; others are done when they are asked for
@@ -86,7 +86,7 @@ class Viewer:
             self.wind = gui.add_slider("Wind", 0.0, 20.0, 0.5, 0.0, hint=hint, visible=show.outfit.feels_wind)
             self.wind.on_update(lambda _: setattr(steering, "wind", float(self.wind.value)))
         with gui.add_folder("Show"):
-            self.stages = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in STAGES}
+            self.methods = {name: gui.add_checkbox(name.capitalize(), name == "psi") for name in METHODS}
             self.body = gui.add_checkbox("Body", True)
             self.wireframe = gui.add_checkbox("Wireframe", False)
             hint = f"strain: red from {STRAINED:.0%}; penetration: red from {1e3 * DEEP:.0f} mm inside the body"
@@ -119,10 +119,10 @@ class Viewer:
                 due = time.perf_counter()
                 continue
             self._one_more = False
-            stages = tuple(name for name in STAGES if self.stages[name].value)
-            if set(stages) - set(self.show.stages) - {"psi"}:
+            methods = tuple(name for name in METHODS if self.methods[name].value)
+            if set(methods) - set(self.show.methods) - {"psi"}:
                 self.text.content = "Compiling what stands beside Psi: up to a minute, the first time"
-            self.show.stages = stages
+            self.show.methods = methods
             self._shown = self.show.frame()
             began = time.perf_counter()
             self._draw()
@@ -159,26 +159,26 @@ class Viewer:
         if self._shown is None:
             return
         garments, bodies = self._shown
-        others = [stage for stage in garments if stage != "psi"]
+        others = [method for method in garments if method != "psi"]
         worn_by = {"psi": bodies[0]} | dict(zip(others, bodies[len(bodies) - len(others) :], strict=True))
         here = self.show.past[-1].translation * [1, 0, 1] if self.follow.value else np.zeros(3)
         here = here + [0.65 * APART * len(others), 0, 0]  # all in what the panel leaves free
         drawn = set()
         with self.server.atomic():
             self.floor.position = tuple(-(here % GRID))
-            for stage, crowd in garments.items():
-                faces, rest = self.show.outfit.mesh(stage)
+            for method, crowd in garments.items():
+                faces, rest = self.show.outfit.mesh(method)
                 if others:
-                    drawn.add(self._label(stage, worn_by[stage] - here))
+                    drawn.add(self._label(method, worn_by[method] - here))
                 for i, vertices in enumerate(crowd):
-                    drawn.add(self._mesh(f"/{stage}/{i}", vertices - here, faces, COLOURS[stage]))
+                    drawn.add(self._mesh(f"/{method}/{i}", vertices - here, faces, COLOURS[method]))
                 if self.points.value == "strain":
                     drawn.add(
-                        self._points(f"/{stage}/strain", crowd[0] - here, strain(crowd[0], rest, faces) / STRAINED)
+                        self._points(f"/{method}/strain", crowd[0] - here, strain(crowd[0], rest, faces) / STRAINED)
                     )
                 elif self.points.value == "penetration":
-                    depth, _ = metrics.penetration(crowd[0], worn_by[stage], self.show.body_faces)
-                    drawn.add(self._points(f"/{stage}/penetration", crowd[0] - here, depth / DEEP))
+                    depth, _ = metrics.penetration(crowd[0], worn_by[method], self.show.body_faces)
+                    drawn.add(self._points(f"/{method}/penetration", crowd[0] - here, depth / DEEP))
             for i, vertices in enumerate(bodies if self.body.value else []):
                 drawn.add(self._mesh(f"/body/{i}", vertices - here, self.show.body_faces, COLOURS["body"]))
             for name in set(self.meshes) - drawn:
@@ -195,14 +195,14 @@ class Viewer:
             )
         return name
 
-    def _label(self, stage: str, body: np.ndarray) -> str:
-        """Draw the name of a stage over its head."""
-        name, place = f"/{stage}/name", (body[:, 0].mean(), body[:, 1].max() + 0.1, body[:, 2].mean())
+    def _label(self, method: str, body: np.ndarray) -> str:
+        """Draw the name of a method over its head."""
+        name, place = f"/{method}/name", (body[:, 0].mean(), body[:, 1].max() + 0.1, body[:, 2].mean())
         if name in self.meshes:
             self.meshes[name].position = place
         else:
             self.meshes[name] = self.server.scene.add_label(
-                name, stage.capitalize(), position=place, anchor="bottom-center"
+                name, method.capitalize(), position=place, anchor="bottom-center"
             )
         return name
 

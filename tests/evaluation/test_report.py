@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from samples import random_force_psi
 
-from clothjax.evaluation import metrics, report
+from clothjax.evaluation import metrics, report, rollouts
 from clothjax.material import configured_material
 from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
@@ -82,7 +82,7 @@ def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):
 def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatch):
     forced = random_force_psi()
     models = {"network": {"w": np.ones(3)}, "predictor": {"v": np.ones(2)}}
-    monkeypatch.setattr(trained, "network", lambda _: (None, models["network"]))
+    monkeypatch.setattr(trained, "network", lambda _: (forced.experiment.config, models["network"]))
     monkeypatch.setattr(trained, "psi", lambda _: trained.TrainedPsi(None, {}, models["predictor"], ()))
 
     def number(experiment=forced.experiment):
@@ -96,3 +96,19 @@ def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatc
         before, models[part] = models[part], {"w": np.zeros(3)}
         assert number() != first
         models[part] = before
+
+
+def test_trajectories_of_other_networks_are_refused(tmp_path, monkeypatch):
+    """A run that was trained further since it was measured would be shown beside what it no longer does."""
+    monkeypatch.chdir(tmp_path)
+    run, track = trained.find("tshirt_pose"), np.ones((2, 3, 3), np.float32)
+    rollouts.output_folder(run).mkdir(parents=True)
+    rollouts.Tracks({"lbs": track, "psi": 2 * track}, 3 * track).save(run, "walk_3")
+    found = rollouts.Tracks.load(run, "walk_3")
+    assert set(found.methods) == {"lbs", "psi"}
+    np.testing.assert_array_equal([found.methods["psi"], found.solver], [2 * track, 3 * track])
+    predictor = trained.psi(run).predictor | {"more": np.zeros(1)}
+    again = trained.psi(run)._replace(predictor=predictor)
+    monkeypatch.setattr(trained, "psi", lambda run: again)
+    with pytest.raises(ValueError, match=r"trajectories_walk_3.npz: is of other networks .* evaluate"):
+        rollouts.Tracks.load(run, "walk_3")

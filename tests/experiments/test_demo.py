@@ -62,24 +62,24 @@ def test_what_is_shown_is_psi_on_the_pose_of_the_player(clips):
 def test_stages_beside_each_other_wear_the_same_skirt(clips):
     """Far from the origin, through a turn, and also one that was left out for a while."""
     show = live.Show(clips, FAMILIES, SKIRT)
-    show.stages = live.STAGES
+    show.methods = live.METHODS
     show.player.place, show.player.heading = np.array([30.0, -20.0]), 2.0
     show.steering.faster()
     pinned = None
     for t in range(40):
         if t == 15:
-            show.stages = ("psi", "skinning")
+            show.methods = ("psi", "skinning")
         if t == 30:
-            show.stages = live.STAGES
+            show.methods = live.METHODS
         show.steering.turn(0.05)
         garments, bodies = show.frame()
-        assert tuple(garments) == show.stages and len(bodies) == len(show.stages)
+        assert tuple(garments) == show.methods and len(bodies) == len(show.methods)
         pinned = storage.load_garment("skirt_1000", storage.load_body("body")).pinned if pinned is None else pinned
-        for i, stage in enumerate(show.stages):
-            apart = np.linalg.norm(garments[stage][0] - [i * live.APART, 0, 0] - garments["psi"][0], axis=-1)
-            assert apart[pinned].max() < 1e-3, (t, stage)
+        for i, method in enumerate(show.methods):
+            apart = np.linalg.norm(garments[method][0] - [i * live.APART, 0, 0] - garments["psi"][0], axis=-1)
+            assert apart[pinned].max() < 1e-3, (t, method)
             # in a turn the solver's skirt is 6 cm from Psi's in the mean; in another frame it would be metres off
-            assert apart.max() < 0.3 and (apart.mean() < 0.1 or stage == "skinning"), (t, stage)
+            assert apart.max() < 0.3 and (apart.mean() < 0.1 or method == "skinning"), (t, method)
     faces, rest = show.outfit.mesh("phi")
     assert faces.shape == show.outfit.mesh("psi")[0].shape
     assert live.strain(rest, rest, faces).max() == 0
@@ -88,7 +88,7 @@ def test_stages_beside_each_other_wear_the_same_skirt(clips):
 @pytest.mark.slow
 def test_phi_frame_by_frame_is_phi_all_at_once(clips):
     show = live.Show(clips, FAMILIES, SKIRT)
-    show.stages = ("phi",)
+    show.methods = ("phi",)
     show.steering.faster()
     found, poses = [], []
     for _ in range(8):
@@ -218,26 +218,26 @@ def test_the_panel_reaches_what_is_shown(viewer):
     assert not viewer.wind.visible
     viewer.garment.value, viewer.wind.value = "skirt", 0.0
     viewer.run(1)
-    viewer.points.value, viewer.stages["skinning"].value, viewer.body.value = "strain", True, False
+    viewer.points.value, viewer.methods["skinning"].value, viewer.body.value = "strain", True, False
     viewer.run(2)
     assert set(viewer.meshes) == {
-        f"/{stage}/{part}" for stage in ("psi", "skinning") for part in ("0", "strain", "name")
+        f"/{method}/{part}" for method in ("psi", "skinning") for part in ("0", "strain", "name")
     }
-    here, there = (np.array(viewer.meshes[f"/{stage}/name"].position) for stage in ("psi", "skinning"))
+    here, there = (np.array(viewer.meshes[f"/{method}/name"].position) for method in ("psi", "skinning"))
     np.testing.assert_allclose(there - here, [live.APART, 0, 0], atol=1e-5)
 
 
 def test_what_is_inside_the_body_is_red(viewer):
-    viewer.points.value, viewer.stages["skinning"].value = "penetration", True
+    viewer.points.value, viewer.methods["skinning"].value = "penetration", True
     viewer.betas[0].value = 3.0
     viewer.run(1)
     inside = {}
-    for stage, body in zip(("psi", "skinning"), viewer._shown[1], strict=True):
-        depth, _ = metrics.penetration(viewer._shown[0][stage][0], body, viewer.show.body_faces)
-        red, _, blue = viewer.meshes[f"/{stage}/penetration"].colors.T.astype(int)
+    for method, body in zip(("psi", "skinning"), viewer._shown[1], strict=True):
+        depth, _ = metrics.penetration(viewer._shown[0][method][0], body, viewer.show.body_faces)
+        red, _, blue = viewer.meshes[f"/{method}/penetration"].colors.T.astype(int)
         clear = np.abs(depth / DEEP - 0.5) > 0.01  # colours are rounded
         np.testing.assert_array_equal((red > blue)[clear], (depth > 0.5 * DEEP)[clear])
-        inside[stage] = (depth > 0).mean()
+        inside[method] = (depth > 0).mean()
     assert inside["psi"] < inside["skinning"]
 
 

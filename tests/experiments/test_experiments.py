@@ -116,7 +116,7 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch
     experiment, _ = rollouts.load_run(finished)
     motion = experiment.config.evaluation.motions[0]
     tracks, both = rollouts.Tracks.load(finished, motion), pictures.perform_beside(finished, experiment, motion, 4)
-    np.testing.assert_array_equal(both["Psi"].parts[-1].vertices, tracks.stages["psi"][:4])
+    np.testing.assert_array_equal(both["Psi"].parts[-1].vertices, tracks.methods["psi"][:4])
     np.testing.assert_array_equal(both["reference solver"].parts[-1].vertices, tracks.solver[:4])
     with pytest.raises(ValueError, match=r"b\.glb: --beside is of \.webp and \.mp4, not of \.glb"):
         render.main([str(finished), "--out", str(finished / "b.glb"), "--beside"])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from samples import settings
 
-from clothjax.evaluation.report import _stages
+from clothjax.evaluation.report import _methods
 from clothjax.runtime import trained
 from clothjax.training import pipeline
 from experiments.benchmark import pareto, report, variants
@@ -92,7 +92,7 @@ def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
     last = "blendshapes" if network == "ncs" else "output"
     model["params"][last] = jax.tree.map(lambda x: 1000 * np.asarray(x), model["params"][last])
     monkeypatch.setattr(trained, "network", lambda _: (config, model))
-    expected = _stages(case.experiment, model, run)[network](case.character, case.clips[0])()
+    expected = _methods(case.experiment, model, run)[network](case.character, case.clips[0])()
     found = variants._baseline(case, run, tmp_path, variants.SHAPES)
     far = {name: np.abs(each.tracks[0] - expected).max() for name, each in found.items()}
     still = variants._skinning(case, tmp_path).tracks[0]
