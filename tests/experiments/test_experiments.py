@@ -264,7 +264,7 @@ def test_a_run_is_measured_with_other_settings_on_a_clip_shorter_than_the_solver
 
 def test_the_report_of_several_garments(tmp_path, monkeypatch):
     """Parts that were kept are there until all garments are measured: a stop at the last loses none."""
-    monkeypatch.setattr(trained, "network", lambda _: (Config(), {}))
+    monkeypatch.setattr(trained, "configured", lambda _: Config())
     figures = {"skirt": (0.1, 2.0, True), "dress": (0.3, 1.0, False)}
     kept = [tmp_path / name / measures.MEASURED for name in figures]
     for path in kept:

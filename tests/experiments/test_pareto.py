@@ -103,11 +103,11 @@ def test_a_peers_graph_is_what_was_trained(run, tmp_path, monkeypatch):
 
 
 def test_what_was_trained_for_something_else_is_not_compared(monkeypatch):
-    config, model = settings("ncs", steps=20), {}
+    config = settings("ncs", steps=20)
     physics = dataclasses.replace(config.physics, friction_coefficient=2 * config.physics.friction_coefficient)
     other = dataclasses.replace(config, physics=physics, motions=("run_0",))
     read = {"one": config, "two": other}
-    monkeypatch.setattr(trained, "network", lambda name: (read[str(name)], model))
+    monkeypatch.setattr(trained, "configured", lambda name: read[str(name)])
     with pytest.raises(ValueError, match="two: trained with another physics and motions than one"):
         variants.prepare([Path("one"), Path("two")], (), 10)
     thinner = dataclasses.replace(config, evaluation=dataclasses.replace(config.evaluation, betas=0.3))

@@ -60,7 +60,7 @@ def test_the_garments_of_the_thesis_come_with_the_library():
 
 def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, monkeypatch):
     config = small()
-    monkeypatch.setattr(thesis.trained, "network", lambda _: (config, {}))
+    monkeypatch.setattr(thesis.trained, "configured", lambda _: config)
     monkeypatch.setattr(
         thesis.checkpoint, "steps", lambda folder: [config.stage2.steps] if "stage2" in str(folder) else []
     )
