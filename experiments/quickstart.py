@@ -28,7 +28,7 @@ from clothjax.training.pipeline import run_directory, train
 from clothjax.types import Motion
 
 CONFIG = str(Path("configs") / "quickstart.yaml")
-ONNX_FRAMES = 100
+ONNX_FRAMES, USUAL = 100, 95  # and the share of them in percent whose error is told
 
 
 def main(argv: list[str]) -> None:
@@ -65,8 +65,8 @@ def main(argv: list[str]) -> None:
             **clock,
             "this_session_training_seconds": trained,
             "this_session_seconds": time.monotonic() - started,
-            # in a frame a vertex between two faces of the body may be pushed by the other one
-            "onnx_error_mm": float(np.median(onnx_errors.max(axis=1))),
+            # a few frames are left out: in one, a vertex between two faces of the body may be pushed by the other
+            "onnx_error_mm": float(np.percentile(onnx_errors.max(axis=1), USUAL)),
             "onnx_worst_error_mm": float(onnx_errors.max()),
             "onnx_frames": len(part.rotations),
             "glb_error_mm": {name: 1e3 * error for name, error in glb_error.items()},
@@ -77,16 +77,16 @@ def main(argv: list[str]) -> None:
     (directory / "report.json").write_text(json.dumps(report, indent=1) + "\n")
     (directory / "report.md").write_text(readable(report, config))
     print(table(report["evaluation"]))
-    print(alike(report["quickstart"]))
+    print(onnx_sentence(report["quickstart"]))
     print(f"look at {directory / 'comparison.png'} and {directory / 'walk.webp'}; figures in {directory / 'report.md'}")
 
 
-def alike(figures: dict) -> str:
+def onnx_sentence(figures: dict) -> str:
     """Return how near ONNX Runtime is to jax, in a sentence."""
     usual, worst = figures["onnx_error_mm"], figures["onnx_worst_error_mm"]
     return (
-        f"ONNX Runtime differs from jax by {usual:.4f} mm at most in the median of {figures['onnx_frames']} frames, by "
-        f"{worst:.4f} in the worst."
+        f"In {USUAL} % of {figures['onnx_frames']} frames no vertex of ONNX Runtime is farther than {usual:.4f} mm "
+        f"from that of jax, in the worst frame {worst:.4f} mm."
     )
 
 
@@ -108,7 +108,7 @@ canonical displacement (`hold_gap`).
 
 {table(report["evaluation"])}
 
-{alike(figures)}
+{onnx_sentence(figures)}
 """
 
 

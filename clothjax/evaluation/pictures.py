@@ -86,7 +86,7 @@ def perform_beside(run: Path, experiment: Experiment, motion: str, frames: int) 
     """Return Psi and the reference solver over at most `frames` frames of a clip, by name, as `perform` does.
 
     Raises:
-        ValueError: if `clothjax evaluate` has not measured the run on this clip.
+        ValueError: if `clothjax evaluate` has not measured the run, as it is now, on this clip.
     """
     tracks, clip = Tracks.load(run, motion), assembly.motion(experiment, motion)
     frames = min(frames, len(tracks.solver))
@@ -195,7 +195,7 @@ def write_comparison(run: Path, experiment: Experiment, motion: str, out: Path) 
     """Write a PNG of skinning, Phi, Psi and the reference solver at the same moments of a clip.
 
     Raises:
-        ValueError: if `clothjax evaluate` has not measured the run on this clip.
+        ValueError: if `clothjax evaluate` has not measured the run, as it is now, on this clip.
     """
     tracks = Tracks.load(run, motion)
     shown = {label: tracks.methods[name] for name, label in ROWS.items()} | {"reference solver": tracks.solver}

@@ -150,6 +150,7 @@ class Measured(NamedTuple):
     character: Character
     methods: dict[str, Method]
     blendshapes: np.ndarray | None  # of Phi, [K, V, 3] m; None where there is no Phi
+    networks: int  # their number, of `rollouts.networks`
 
     @classmethod
     def load(cls, run: Path, settings: EvaluationConfig | None = None) -> "Measured":
@@ -158,7 +159,7 @@ class Measured(NamedTuple):
         config = experiment.config
         character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
         shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-        return cls(run, experiment, character, _methods(experiment, model, run), shapes)
+        return cls(run, experiment, character, _methods(experiment, model, run), shapes, rollouts.networks(run))
 
 
 def _parts_file(run: Path) -> Path:
@@ -173,15 +174,15 @@ def _forget(run: Path) -> None:
 def _fingerprint(measured: Measured) -> int:
     """Return a number that tells evaluations of other models, or with other settings, apart."""
     settings = configuration.to_dict(measured.experiment.config)
-    return run_folder.fingerprint(settings, [np.asarray(rollouts.networks(measured.run))])
+    return run_folder.fingerprint(settings | {"networks": measured.networks})
 
 
 def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
     """Measure all methods on one motion, by name, and save their trajectories."""
-    run, experiment, character, methods, shapes = measured
+    run, experiment, character, methods, shapes, _ = measured
     clip = assembly.evaluation_motion(experiment, name)
     tracks, converged = simulate(experiment, methods, character, clip)
-    tracks.save(run, name)
+    tracks.save(run, name, measured.networks)
     return measure(experiment, character, clip, tracks, converged, shapes)
 
 
@@ -308,7 +309,7 @@ def measure_push(measured: Measured, name: str, push: str) -> dict[str, float]:
 
 def measure_long(measured: Measured, name: str) -> dict[str, dict]:
     """Measure all methods but skinning over the long rollout on a motion, with their times, and Psi against Phi."""
-    _, experiment, character, methods, _ = measured
+    experiment, character, methods = measured.experiment, measured.character, measured.methods
     clip = assembly.motion(experiment, name)
     clip = assembly.there_and_back(clip, experiment.config.evaluation.long_frames + 2)
     tracks, result = {}, {}

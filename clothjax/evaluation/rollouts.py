@@ -12,6 +12,7 @@ import numpy as np
 from clothjax.body import motion_clips
 from clothjax.config import EvaluationConfig
 from clothjax.networks.animators import MakeAnimator, phi_animator
+from clothjax.networks.normalisation import ForceScales
 from clothjax.runtime import inference, trained
 from clothjax.runtime.models import Model
 from clothjax.simulation import assembly, characters, rollout
@@ -29,10 +30,14 @@ class Tracks(NamedTuple):
     methods: dict[str, np.ndarray]  # of each method, by its name: `lbs`, `phi`, `psi` or a baseline's
     solver: np.ndarray  # of the reference solver; of a long motion, its start
 
-    def save(self, run: Path, motion: str) -> None:
-        """Save the trajectories in a run's folder, for pictures."""
+    def save(self, run: Path, motion: str, of: int) -> None:
+        """Save the trajectories in a run's folder, for pictures.
+
+        Args:
+            of: the number of the `networks` that they are of.
+        """
         arrays: dict[str, Any] = {name: np.asarray(track, np.float32) for name, track in self.methods.items()}
-        np.savez_compressed(_tracks_path(run, motion), **arrays, solver=self.solver, networks=networks(run))
+        np.savez_compressed(_tracks_path(run, motion), **arrays, solver=self.solver, networks=of)
 
     @classmethod
     def load(cls, run: Path, motion: str) -> "Tracks":
@@ -41,21 +46,26 @@ class Tracks(NamedTuple):
         Raises:
             ValueError: if there are none, or the run has been trained since.
         """
-        path, first = _tracks_path(run, motion), f"run `python -m clothjax evaluate {run} --motions {motion}` first"
+        path, advice = _tracks_path(run, motion), f"run `python -m clothjax evaluate {run} --motions {motion}` first"
         if not path.is_file():
-            raise ValueError(f"{path}: no such file; {first}")
+            raise ValueError(f"{path}: no such file; {advice}")
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
         if arrays.pop("networks", None) != networks(run):
-            raise ValueError(f"{path}: is of other networks than {run} has now; {first}")
+            raise ValueError(f"{path}: of other networks than {run} has now, or of an older clothjax; {advice}")
         solver = arrays.pop("solver")
         return cls(arrays, solver)
 
 
 def networks(run: Path) -> int:
-    """Return a number that tells the networks of runs apart."""
+    """Return a number that tells the networks of runs apart: of what is stored, not of what each machine computes."""
     config, model = trained.network(run)
-    return run_folder.fingerprint({}, jax.tree.leaves([model, *(() if config.peer.network else trained.psi(run)[1:])]))
+    if config.peer.network:
+        return run_folder.fingerprint({}, jax.tree.leaves(model))
+    _, _, predictor, scales = trained.psi(run)
+    if isinstance(scales, ForceScales):
+        scales = scales._replace(whitening=None)  # the root of Phi's preconditioner
+    return run_folder.fingerprint({}, jax.tree.leaves([model, predictor, scales]))
 
 
 def output_folder(run: Path) -> Path:

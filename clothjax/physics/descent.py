@@ -81,7 +81,6 @@ def _step(last: _Iterate, objective: Objective, precondition: Precondition, boun
     energy, gradient = objective(tried)
     slope = last.share * jnp.sum(last.gradient * last.direction)
     falls = energy <= last.energy + SUFFICIENT * slope + ROUNDING * jnp.abs(last.energy)
-    falls |= last.energy == jnp.inf  # a first energy is kept even if it is not a number
     move, turn = tried - last.latent, gradient - last.gradient
     curvature = jnp.sum(move * turn)
     convex = falls & (curvature > 1e-10 * jnp.sqrt(jnp.sum(move * move) * jnp.sum(turn * turn)))
@@ -104,7 +103,8 @@ def _step(last: _Iterate, objective: Objective, precondition: Precondition, boun
         newest=row,
     )
     # the minimum of the parabola through both energies and the slope
-    shorter = jnp.clip(-slope / (2.0 * jnp.maximum(energy - last.energy - slope, 1e-20)), *SHORTER)
+    bend = jnp.where(falls, 1.0, energy - last.energy - slope)  # which the blank descent has none of
+    shorter = jnp.clip(-slope / (2.0 * jnp.maximum(bend, 1e-20)), *SHORTER)
     shorter = last.share * jnp.where(jnp.isfinite(energy), shorter, SHORTER[0])
     return there._replace(
         direction=jnp.where(falls, _direction(there, precondition, bound), last.direction),

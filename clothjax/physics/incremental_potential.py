@@ -84,18 +84,19 @@ def elements(
         "inertia": lambda: inertia(moved - step.velocity, step.mass, step.timestep),
     }
     if (contact := step.contact) is not None:
-        terms["collision"] = lambda: collisions(new, contact, config, laws)
-    if contact is not None and (touching := step.touching) is not None:
-        terms["friction"] = lambda: frictions(moved, contact, step.mass, touching, config)
+        terms["collision"] = lambda: plane_collision(new, contact, config, laws)
+    if contact is not None and (near := step.touching) is not None:
+        terms["friction"] = lambda: plane_friction(moved, contact, step.mass, near, config)
     if (edges := step.edge_contact) is not None:
         terms["edge_collision"] = lambda: edge_collision(at_corners(new, mesh.edges), edges, config, laws)
     if (itself := step.self_contact) is not None:
-        points = jnp.concatenate([new[:, None], new[itself.corners]], axis=1)
-        terms["self_collision"] = lambda: self_collision(points, itself, config, laws)
+        terms["self_collision"] = lambda: self_collision(
+            jnp.concatenate([new[:, None], new[itself.corners]], axis=1), itself, config, laws
+        )
     return {name: term() for name, term in terms.items() if name not in {*config.without, *without}}
 
 
-def collisions(
+def plane_collision(
     new: Float[Array, "V 3"], contact: Contact, config: PhysicsConfig, laws: Laws = LAWS
 ) -> Float[Array, " V"]:
     """Collision energy [V] J of vertices [V, 3] m with their planes."""
@@ -103,7 +104,7 @@ def collisions(
     return config.collision_stiffness * laws.collision(gap, config.collision_offset)
 
 
-def frictions(
+def plane_friction(
     moved: Float[Array, "V 3"],
     contact: Contact,
     mass: Float[Array, " V"],
@@ -165,11 +166,11 @@ def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: Phys
 
 def _in_kernels(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:
     """Return the energies that kernels have, in J."""
-    terms = {
-        "stretching": kernels.stretching(new, step.rest, step.material, mesh),
-        "bending": kernels.bending(new, step.rest, step.material, mesh),
+    terms: dict[str, Callable[[], Array]] = {
+        "stretching": lambda: kernels.stretching(new, step.rest, step.material, mesh),
+        "bending": lambda: kernels.bending(new, step.rest, step.material, mesh),
     }
-    if step.edge_contact is not None:
-        stiffness, offset = config.collision_stiffness, config.collision_offset
-        terms["edge_collision"] = kernels.edge_collision(new, step.edge_contact, mesh, stiffness, offset)
-    return {name: energy for name, energy in terms.items() if name not in config.without}
+    if (edges := step.edge_contact) is not None:
+        constants = config.collision_stiffness, config.collision_offset
+        terms["edge_collision"] = lambda: kernels.edge_collision(new, edges, mesh, *constants)
+    return {name: term() for name, term in terms.items() if name not in config.without}

@@ -119,7 +119,6 @@ def psi(run: str | Path) -> TrainedPsi:
     else:
         directory, *later = (Path(run) / stage / "checkpoints" for stage in STAGES[1:])
         parts, _ = checkpoint.read(directory, "average", "normalizers", "garment")
-        config = configured(run)
         garment, predictor = parts["garment"], parts["average"]
         for trained_on in later:
             if checkpoint.steps(trained_on):

@@ -27,7 +27,7 @@ def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     monkeypatch.setattr(metrics, "gaps", lambda steps: {})
     experiment = forced.experiment
     character = assembly.dress(experiment, jnp.zeros(10), configured_material(experiment.config))
-    measured = report.Measured(tmp_path, experiment, character, {}, None)
+    measured = report.Measured(tmp_path, experiment, character, {}, None, 0)
     for push in report.PUSHES:
         assert report.measure_push(measured, "walk_3", push) == {}
     by_name = dict(zip(report.PUSHES, asked))
@@ -45,7 +45,7 @@ def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
     experiment = random_force_psi().experiment
     asked = []
 
-    def stage(name):
+    def method(name):
         def make(character, clip):
             asked.append((name, character, clip))
             return lambda: np.full((len(clip.translation) - 2, 1, 3), len(asked), np.float32)
@@ -58,8 +58,8 @@ def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
 
     monkeypatch.setattr(metrics, "step_measures", step_measures)
     monkeypatch.setattr(metrics, "gaps", lambda steps: {"of": steps})
-    stages = {"lbs": stage("lbs"), "phi": stage("phi"), "psi": stage("psi")}
-    measured = report.Measured(tmp_path, experiment, None, stages, None)
+    methods = {name: method(name) for name in ("lbs", "phi", "psi")}
+    measured = report.Measured(tmp_path, experiment, None, methods, None, 0)
     for wearer, (betas, material) in assembly.wearers(experiment).items():
         asked.clear()
         assert report.measure_wearer(measured, "walk_3", wearer) == {"phi": {"of": 1}, "psi": {"of": 3}}
@@ -73,7 +73,7 @@ def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
 
 def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):
     experiment = random_force_psi().experiment
-    measured = report.Measured(tmp_path, experiment, None, {}, None)
+    measured = report.Measured(tmp_path, experiment, None, {}, None, 0)
     monkeypatch.setattr(report.Measured, "load", lambda *_: measured)
     with pytest.raises(ValueError, match=r"two motions would have one name in the report: walk_3, mine/walk_3\.h5"):
         report.evaluate(tmp_path, ["walk_3", "mine/walk_3.h5"])
@@ -86,7 +86,7 @@ def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatc
     monkeypatch.setattr(trained, "psi", lambda _: trained.TrainedPsi(None, {}, models["predictor"], ()))
 
     def number(experiment=forced.experiment):
-        return report._fingerprint(report.Measured(tmp_path, experiment, None, {"psi": None}, None))
+        return report._fingerprint(report.Measured(tmp_path, experiment, None, {}, None, rollouts.networks(tmp_path)))
 
     first, config = number(), forced.experiment.config
     settings = dataclasses.replace(config.evaluation, gap_frames=config.evaluation.gap_frames + 1)
@@ -103,12 +103,12 @@ def test_trajectories_of_other_networks_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run, track = trained.find("tshirt_pose"), np.ones((2, 3, 3), np.float32)
     rollouts.output_folder(run).mkdir(parents=True)
-    rollouts.Tracks({"lbs": track, "psi": 2 * track}, 3 * track).save(run, "walk_3")
+    rollouts.Tracks({"lbs": track, "psi": 2 * track}, 3 * track).save(run, "walk_3", rollouts.networks(run))
     found = rollouts.Tracks.load(run, "walk_3")
     assert set(found.methods) == {"lbs", "psi"}
     np.testing.assert_array_equal([found.methods["psi"], found.solver], [2 * track, 3 * track])
     predictor = trained.psi(run).predictor | {"more": np.zeros(1)}
     again = trained.psi(run)._replace(predictor=predictor)
     monkeypatch.setattr(trained, "psi", lambda run: again)
-    with pytest.raises(ValueError, match=r"trajectories_walk_3.npz: is of other networks .* evaluate"):
+    with pytest.raises(ValueError, match=r"trajectories_walk_3.npz: of other networks .* evaluate"):
         rollouts.Tracks.load(run, "walk_3")

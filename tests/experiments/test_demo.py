@@ -59,7 +59,7 @@ def test_what_is_shown_is_psi_on_the_pose_of_the_player(clips):
 
 
 @pytest.mark.slow
-def test_stages_beside_each_other_wear_the_same_skirt(clips):
+def test_methods_beside_each_other_wear_the_same_skirt(clips):
     """Far from the origin, through a turn, and also one that was left out for a while."""
     show = live.Show(clips, FAMILIES, SKIRT)
     show.methods = live.METHODS

@@ -59,7 +59,7 @@ def finished(tmp_path_factory):
 
 def test_the_quickstart_leaves_everything_it_promises(finished):
     report = json.loads((finished / "report.json").read_text())
-    for stage in ("lbs", "phi", "psi"):
+    for method in ("lbs", "phi", "psi"):
         assert {
             "energy_gap",
             "hold_gap",
@@ -72,7 +72,7 @@ def test_the_quickstart_leaves_everything_it_promises(finished):
             "swing_correlation",
             "wrinkle_ratio",
             "rollout_error_mm",
-        } <= set(report["evaluation"][stage])
+        } <= set(report["evaluation"][method])
     assert report["evaluation"]["lbs"]["energy_gap"] == pytest.approx(1.0)
     assert report["evaluation"]["psi"]["finite"] is True
     assert np.isfinite(report["evaluation"]["psi"]["psi_phi_mm_slope"])
@@ -103,8 +103,8 @@ def test_evaluate_and_render_from_the_command_line(finished, capsys, monkeypatch
     both = json.loads((finished / "both.json").read_text())
     assert set(one["motions"]) == {"twist_3", "dance_3"}
     for report in (one, both):
-        for stage in report["evaluation"].values():
-            stage.pop("ms_per_frame", None)
+        for measured in report["evaluation"].values():
+            measured.pop("ms_per_frame", None)
     assert one == both
     assert "| hold_gap |" in capsys.readouterr().out
     render.main([str(finished), "--motions", "twist_3", "--out", str(finished / "t.webp"), "--frames", "3"])
@@ -274,8 +274,8 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
     def measured(folder, motions, jobs):
         assert motions == ["walk_3"] and jobs == 2 and all(path.exists() for path in kept)
         gap, most, finite = figures[folder.name]
-        stage = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
-        return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), stage), "motions": {}}
+        found = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
+        return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), found), "motions": {}}
 
     monkeypatch.setattr(measures, "_evaluated", measured)
     report = measures.evaluate_packed({name: tmp_path / name for name in figures}, jobs=2)

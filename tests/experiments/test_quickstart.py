@@ -7,7 +7,7 @@ from experiments import quickstart
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """Ten minutes on two cores; it must be quiet there, one bar is a time."""
+    """Training takes eight minutes of two cores; it must be quiet there, one bar is a time."""
     directory = tmp_path_factory.mktemp("quickstart") / "run"
     quickstart.main(["--directory", str(directory)])
     return json.loads((directory / "report.json").read_text())
@@ -23,7 +23,7 @@ def test_the_quickstart_meets_its_bars(report):
     assert psi["hold_gap"] <= 0.6
     assert psi["penetration_percent"] <= 1.0
     assert psi["finite"] is True
-    assert report["quickstart"]["onnx_error_mm"] <= 0.001
+    assert report["quickstart"]["onnx_error_mm"] <= 0.001 and report["quickstart"]["onnx_worst_error_mm"] <= 1.0
 
 
 @pytest.mark.slow

@@ -68,6 +68,30 @@ def test_steps_learn_the_curvature():
     assert left(8) < 0.1 and left(20) < 1e-6
 
 
+def test_a_descent_has_a_gradient(coded):
+    """By the goal of its potential, as finite differences tell."""
+    inverse, decode, _ = coded
+
+    def end(shift):
+        potential = lambda x: jnp.sum((x - decode(GOAL + shift)) ** 2) + 0.1 * jnp.sum(x**4)  # noqa: E731
+        return jnp.sum(descend(inverse, START, decode, potential, 3) * jnp.arange(1.0, 4.0))
+
+    found = jax.grad(end)(jnp.zeros(3))
+    step = 1e-2 * jnp.eye(3)
+    expected = [(end(by) - end(-by)) / 2e-2 for by in step]
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("first", [np.nan, np.inf])
+def test_a_descent_stays_at_a_code_without_energy_and_where_it_is_worse(coded, first):
+    """An energy that is no number cannot fall; an infinite one falls to any finite one, and to nothing else."""
+    inverse, decode, potential = coded
+    there = decode(START)
+    energy = lambda x: potential(x) + jnp.where(jnp.all(x == there), first, jnp.nan)  # noqa: E731
+    for steps in (0, 1, 5):
+        np.testing.assert_array_equal(descend(inverse, START, decode, energy, steps), START)
+
+
 @pytest.mark.parametrize("known, newest", [(0, 0), (1, 1), (5, 3), (5, 20), (descent.MEMORY, 7)])
 def test_the_direction_is_that_of_dense_bfgs(known, newest):
     """Against the update of the whole inverse Hessian, oldest step first, begun with the scaled preconditioner."""

@@ -95,6 +95,21 @@ def all_terms(posed, canonical, mesh, flat=False):
     return incremental_potential.energies(posed, time_step(canonical, mesh, flat), mesh, PhysicsConfig())
 
 
+def test_a_term_that_is_left_out_is_not_evaluated():
+    def fails(*_):
+        raise AssertionError("evaluated")
+
+    canonical, vertices, mesh = sheet(4)
+    step, laws = time_step(canonical, mesh), incremental_potential.Laws(stretching=fails)
+    every = incremental_potential.elements(vertices, step, mesh, PhysicsConfig())
+    left = incremental_potential.elements(vertices, step, mesh, PhysicsConfig(), laws, without={"stretching"})
+    assert set(every) - set(left) == {"stretching"}
+    for name, values in left.items():
+        np.testing.assert_array_equal(values, every[name])
+    with pytest.raises(AssertionError, match="evaluated"):
+        incremental_potential.elements(vertices, step, mesh, PhysicsConfig(), laws)
+
+
 @pytest.mark.parametrize("roll", range(3))
 def test_hood_energies(hood, roll, x64):
     mesh = topology.mesh(hood["faces"])

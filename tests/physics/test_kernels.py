@@ -1,5 +1,6 @@
 """The kernels in C++ compute what jax does."""
 
+import dataclasses
 import sys
 
 import jax
@@ -63,6 +64,16 @@ def test_energies_and_their_gradients_are_those_of_jax(crumpled, term):
     for found, push in (of_kernels(x, step), of_a_mesh(x, step, mesh)):  # which is known or traced
         np.testing.assert_allclose(found, energy, rtol=2e-6)
         np.testing.assert_allclose(push, gradient, rtol=0, atol=1e-5 * np.abs(gradient).max())
+
+
+@needs_compilers
+def test_an_energy_that_a_scene_does_not_have_is_in_no_kernel(crumpled):
+    x, mesh, step = single(crumpled)
+    config = dataclasses.replace(CONFIG, without=("bending",))
+    of_kernels = kernels.in_kernels(potential(mesh, config))
+    np.testing.assert_allclose(of_kernels(x, step), potential(mesh, config)(x, step), rtol=1e-5)
+    assert "ClothBending" in str(jax.make_jaxpr(kernels.in_kernels(potential(mesh)))(x, step))
+    assert "ClothBending" not in str(jax.make_jaxpr(of_kernels)(x, step))
 
 
 @needs_compilers

@@ -14,7 +14,7 @@ from clothjax.training import laplacian_shapes, stage1
 from data_prep.takes import Takes
 
 FOLDER = Path(__file__).parents[2] / "configs"
-CONFIGS = sorted(FOLDER.glob("*.yaml"))
+CONFIGS = sorted([*FOLDER.glob("*.yaml"), *FOLDER.glob("thesis_small/*.yaml")])
 
 
 @pytest.mark.slow  # test_experiments.py trains the quickstart, test_baselines.py the baselines

@@ -15,6 +15,7 @@ from clothjax.simulation import assembly, characters, rollout
 from clothjax.training import loop, stage1
 from clothjax.training.loss import weighing
 from clothjax.training.pool import next_batch
+from clothjax.types import ClothState
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +203,17 @@ def test_gradients_go_through_as_many_frames_as_configured(toy):
     assert cut == pytest.approx(through, rel=1e-5)
     # the first frame moves the second a little: a thousandth here, hundreds of times what rounding does
     assert np.linalg.norm(long - short) > 1e-4 * np.linalg.norm(short)
+
+
+@pytest.mark.parametrize("frames, passed", [(1, [0, 0, 0, 0]), (2, [0, 1, 0, 1]), (3, [0, 1, 1, 0])])
+def test_a_state_is_cut_from_its_past_every_so_many_frames(frames, passed):
+    def total(x, index):
+        cut = rollout._cut(ClothState(x, x, x, x, x), index, frames)
+        return sum(jnp.sum(part) for part in cut)
+
+    value, gradient = jax.vmap(jax.value_and_grad(total), (None, 0))(jnp.ones(2), jnp.arange(4))
+    np.testing.assert_array_equal(value, 10.0)
+    np.testing.assert_array_equal(gradient, 5.0 * np.array(passed)[:, None] * np.ones(2))
 
 
 def test_the_rollout_grows_with_the_curriculum():
