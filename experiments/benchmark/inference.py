@@ -40,17 +40,24 @@ STILL = 300  # frames that a character stands
 NEAR = 1.0  # mm, the error that is put up with
 
 
-def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS) -> dict:
-    """Measure Psi against NCS at the paper's size, and the variants of a garment of the library."""
+def measure(rounds: int, frames: int = FRAMES, crowds: tuple[int, ...] = CROWDS, whole: bool = True) -> dict:
+    """Measure Psi against NCS at the paper's size, and the variants of a garment of the library.
+
+    Args:
+        whole: False leaves out the paper's size, a garment that rests, 4 000 vertices and garments of which a part is
+            kept.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        shipped = _shipped(Path(folder), rounds, frames)
-        errors = {variant["name"]: variant["error_mm"] for variant in shipped["variants"]}
-        paper = paper_size(Path(folder), rounds, errors)
-    report = paper | shipped | _crowd(rounds, crowds)
+        report = _shipped(Path(folder), rounds, frames, whole)
+        if whole:
+            errors = {variant["name"]: variant["error_mm"] for variant in report["variants"]}
+            report |= paper_size(Path(folder), rounds, errors)
+    report |= _crowd(rounds, crowds)
     near = [v for v in report["variants"] if v["error_mm"] <= NEAR and v["runtime"] != "jax"]
     best = min(near, key=lambda v: v["us"])
     shown = {"shipped_us": best["us"], "shipped_form": best["name"], "shipped_floor_us": best["floor_us"]}
-    report["resting"] = _resting()
+    if whole:
+        report["resting"] = _resting()
     report["forces"] = _forces(rounds)
     return report | shown | {"shipped_onnx_us": min(v["us"] for v in near if v["runtime"] == "onnx")}
 
@@ -122,8 +129,11 @@ def paper_size(folder: Path, rounds: int, errors: dict[str, float]) -> dict:
     }
 
 
-def _shipped(folder: Path, rounds: int, frames: int) -> dict:
-    """Measure variants of a garment of the library: time, bytes, and distance in a rollout to the unspecialised one."""
+def _shipped(folder: Path, rounds: int, frames: int, whole: bool) -> dict:
+    """Measure variants of a garment of the library: time, bytes, and distance in a rollout to the unspecialised one.
+
+    Arguments as of `measure`.
+    """
     config = loading.load(SHIPPED).config
     betas = assembly.betas(config)
     model = loading.load(SHIPPED, betas=betas)
@@ -131,9 +141,10 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
     motion = Motion(clip.rotations, (clip.translation - clip.translation[:1]).astype(np.float32), clip.fps)
     reference = np.asarray(inference.animate(model, motion)[0])
     forms = {"plain": model, "folded": specialise.specialise(model)}
-    forms |= _fewer(model)
-    forms["half of the shapes"] = specialise.specialise(model, blendshapes=len(model.network.shapes) // 2)
-    forms["4 influences"] = specialise.specialise(model, max_influences=4)
+    if whole:
+        forms |= _fewer(model)
+        forms["half of the shapes"] = specialise.specialise(model, blendshapes=len(model.network.shapes) // 2)
+        forms["4 influences"] = specialise.specialise(model, max_influences=4)
     library = _library(folder)
     calls, outcomes = {}, {}
     for name, form in forms.items():
@@ -153,24 +164,9 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
             calls[f"jax: {name}"] = jax_call(form)
             outcomes[f"jax: {name}"] = (error, sum(x.nbytes for x in jax.tree.leaves(form.network)), "jax")
     folded = forms["folded"]
-    fine = specialise.on_mesh(model, storage.load_garment(FINE, storage.load_body(config.body)), betas)
-    fine = specialise.specialise(fine)
-    for int8 in (False, True):
-        kind = ", int8" if int8 else ""
-        for output in ("canonical", "none"):
-            path = onnx.to_onnx(folded, folder / "form.onnx", int8=int8, output=output)
-            calls[f"{output}{kind}"] = onnx_call(path, folded)
-        calls[f"on 4 000 vertices{kind}"] = onnx_call(onnx.to_onnx(fine, folder / "fine.onnx", int8=int8), fine)
-    if psi_ffi.available():
-        calls["jax: plain C inside"] = packed_call(folded)
-    shown = specialise.part(folded, np.arange(folded.wearer.template.shape[1] // 2))
-    calls["jax: half of the vertices"] = jax_call(shown)
-    if library:
-        calls["C: half of the vertices"] = c_call(library, native.to_c(shown, folder / "shown.psi"), shown)
-        calls["C: off screen"] = c_call(library, native.to_c(folded, folder / "form.psi"), folded, vertices=False)
-        calls["C: on 4 000 vertices"] = c_call(library, native.to_c(fine, folder / "fine.psi"), fine)
     calls["jax: off screen"] = jax_call(folded, vertices=False)
-    calls["jax: on 4 000 vertices"] = jax_call(fine)
+    if whole:
+        calls |= _parts(folder, model, folded, betas, library)
     us = interleaved(calls, rounds)
     variants = [
         {"name": name, "us": us[name], "error_mm": 1e3 * float(error.mean()), "error_mm_max": 1e3 * float(error.max()),
@@ -188,9 +184,36 @@ def _shipped(folder: Path, rounds: int, frames: int) -> dict:
         }
         | ({"c": worst["C: folded"]} if library else {}),
         "offscreen_ratio": us["jax: off screen"] / us["jax: folded"],
-        "level_of_detail_ratio": us["jax: folded"] / us["jax: on 4 000 vertices"],
         "shipped_us_all": us,
-    }
+    } | ({"level_of_detail_ratio": us["jax: folded"] / us["jax: on 4 000 vertices"]} if whole else {})
+
+
+def _parts(folder: Path, model: Model, folded: Model, betas: np.ndarray, library: Path | None) -> dict[str, Call]:
+    """Return calls of a garment of the library of which more is kept, or less: other meshes, outputs and runtimes.
+
+    Args:
+        folded: the model, specialised.
+        library: of plain C, or None.
+    """
+    calls: dict[str, Call] = {}
+    fine = specialise.on_mesh(model, storage.load_garment(FINE, storage.load_body(model.config.body)), betas)
+    fine = specialise.specialise(fine)
+    for int8 in (False, True):
+        kind = ", int8" if int8 else ""
+        for output in ("canonical", "none"):
+            path = onnx.to_onnx(folded, folder / "form.onnx", int8=int8, output=output)
+            calls[f"{output}{kind}"] = onnx_call(path, folded)
+        calls[f"on 4 000 vertices{kind}"] = onnx_call(onnx.to_onnx(fine, folder / "fine.onnx", int8=int8), fine)
+    if psi_ffi.available():
+        calls["jax: plain C inside"] = packed_call(folded)
+    shown = specialise.part(folded, np.arange(folded.wearer.template.shape[1] // 2))
+    calls["jax: half of the vertices"] = jax_call(shown)
+    if library:
+        calls["C: half of the vertices"] = c_call(library, native.to_c(shown, folder / "shown.psi"), shown)
+        calls["C: off screen"] = c_call(library, native.to_c(folded, folder / "form.psi"), folded, vertices=False)
+        calls["C: on 4 000 vertices"] = c_call(library, native.to_c(fine, folder / "fine.psi"), fine)
+    calls["jax: on 4 000 vertices"] = jax_call(fine)
+    return calls
 
 
 def _resting() -> dict:

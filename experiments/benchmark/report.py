@@ -27,8 +27,10 @@ and the solver are loops and take no turns: their times are of complete loops, o
 Errors are those of `clothjax evaluate`, in rollouts on motions held out of training; `swing_error` is the rms
 error of the velocity that skinning does not explain, over the solver's.
 
-`--quick` only checks that the parts run: a small Phi, few rounds and frames, one garment. It leaves out the slow
-compilations: their times, the growth with vertices and the scenes.
+`--quick` only checks that the parts run: a small Phi, few rounds and frames, one garment. It leaves out what needs
+programs of its own. Of `stage1` that is compilation, recomputed blocks, float64, batches, flops and bytes, the growth
+with vertices and the scenes. Of `inference` it is the paper's size and NCS, garments that rest, 4 000 vertices, parts
+of a garment and fewer blend shapes. Of `pareto` it is Phi of many steps, the solver stopped early and fewer shapes.
 
 `--compare OLD.json` sets the times of both reports side by side and flags ratios beyond the noise of both. For `pareto`
 it also tells whether both put the points in the same order (Kendall's tau).
@@ -55,7 +57,7 @@ SCENES = ["configs/quickstart.yaml"]
 PAPER = ["configs/paper_tshirt.yaml"]
 ROUNDS, QUICK_ROUNDS = 5, 3  # of training steps
 INFERENCE = {"rounds": 100}
-QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4)}
+QUICK_INFERENCE = {"rounds": 3, "frames": 20, "crowds": (1, 4), "whole": False}
 PARETO = {"rounds": 30, "frames": 60, "gaps": 5}
 QUICK_PARETO = {
     "rounds": 3, "frames": 12, "gaps": 1, "motions": ("walk_3",),
@@ -164,7 +166,7 @@ def training_step(quick: bool) -> dict:
     """Measure stage 1."""
     config = configuration.cli(Config, QUICK if quick else PAPER)
     if quick:
-        return stage1.measure(config, QUICK_ROUNDS, compiling=False)
+        return stage1.measure(config, QUICK_ROUNDS, whole=False)
     small = configuration.cli(Config, [*SCENES, "--garment", config.garment])
     parts = {
         "the processor, the convolution, compilation, the step": lambda: stage1.measure(config, ROUNDS),

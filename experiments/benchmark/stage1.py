@@ -40,17 +40,18 @@ class Moment(NamedTuple):
     first: stage1.FirstStep
 
 
-def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
+def measure(config: Config, rounds: int, whole: bool = True) -> dict:
     """Measure a training step of a configuration whose body nodes take part in message passing.
 
     Args:
-        compiling: whether to measure the time of compilation too.
+        whole: False leaves out the time of compilation, recomputed blocks, the difference in float64, batches and the
+            flops and bytes of the pieces, which all need programs of their own.
     """
     experiment = assembly.assemble(config)
     moment = first_moment(experiment)
     report = {"vertices": len(experiment.garment.vertices), "width": config.model.width}
-    parts = [lambda: processor(experiment, moment, rounds), lambda: convolution(experiment, rounds)]
-    parts += [lambda: compilation(experiment)] * compiling + [lambda: step(experiment, moment, rounds)]
+    parts = [lambda: processor(experiment, moment, rounds, whole), lambda: convolution(experiment, rounds)]
+    parts += [lambda: compilation(experiment)] * whole + [lambda: step(experiment, moment, rounds, whole)]
     with progress_bar("measuring", len(parts)) as done:
         for index, part in enumerate(parts):
             report |= part()
@@ -58,8 +59,8 @@ def measure(config: Config, rounds: int, compiling: bool = True) -> dict:
     return report
 
 
-def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
-    """Measure encoder and processor, forward and backward, against the textbook's."""
+def processor(experiment: Experiment, moment: Moment, rounds: int, whole: bool) -> dict:
+    """Measure encoder and processor, forward and backward, against the textbook's; arguments as of `measure`."""
     config, state = experiment.config, moment.state
 
     def loss(form, model):
@@ -73,11 +74,9 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
     forms = {"ours": passed, "textbook": textbook.process}
     arguments = (params, state.statistics, moment.first.seen)
     stored, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
-    programs = {
-        "ours": program(loss(forms["ours"], recomputed), *arguments),
-        "ours, nothing recomputed": program(loss(forms["ours"], stored), *arguments),
-        "textbook": program(loss(forms["textbook"], stored), *arguments),
-    }
+    settings = {"ours": recomputed if whole else stored, "textbook": stored}
+    settings |= {"ours, nothing recomputed": stored} if whole else {}
+    programs = {name: program(loss(forms[name.split(",")[0]], one), *arguments) for name, one in settings.items()}
     seconds = interleaved(programs, rounds)
     memory = {name: temporary_bytes(one) for name, one in programs.items()}
 
@@ -88,17 +87,17 @@ def processor(experiment: Experiment, moment: Moment, rounds: int) -> dict:
         )
         return float(np.abs(ours - theirs).max() / np.abs(theirs).max())
 
-    single = difference()
-    with jax.enable_x64(True):
-        arguments = jax.tree.map(solver.to_float64, arguments)
-        double = difference()
-    return {
+    report = {
         "processor_speedup": seconds["textbook"] / seconds["ours"],
         "processor_memory_ratio": memory["ours"] / memory["textbook"],
-        "processor_error_float32": single,
-        "processor_error_float64": double,
+        "processor_error_float32": difference(),
         "processor": {name: {"seconds": seconds[name], "temporary_mib": memory[name] / 2**20} for name in programs},
     }
+    if whole:
+        with jax.enable_x64(True):
+            arguments = jax.tree.map(solver.to_float64, arguments)
+            report["processor_error_float64"] = difference()
+    return report
 
 
 def passed(params: dict, statistics: dict, scene: Scene, seen: Features, model: ModelConfig) -> Array:
@@ -164,19 +163,29 @@ def compilation(experiment: Experiment) -> dict:
             compilation_cache.reset_cache()
 
 
-def step(experiment: Experiment, moment: Moment, rounds: int) -> dict:
-    """Measure the training step and its pieces against the peaks of this machine, and a batch against single steps."""
+def step(experiment: Experiment, moment: Moment, rounds: int, whole: bool) -> dict:
+    """Measure the training step and its pieces against the peaks of this machine, and a batch against single steps.
+
+    Arguments as of `measure`.
+    """
     config, scene = experiment.config, experiment.scene
-    several = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, batch=BATCH, pool=BATCH))
-    states = {"step": moment.state, "batch": stage1.init(scene, moment.clips, several)}
-    updates = {
-        name: stage1.make_update(scene, moment.clips, one, 1, 1)
-        for name, one in {"step": config, "batch": several}.items()
-    }
+    configs = {"step": config}
+    if whole:
+        several = dataclasses.replace(config.stage1, batch=BATCH, pool=BATCH)
+        configs["batch"] = dataclasses.replace(config, stage1=several)
     pieces = _pieces(experiment, moment)
     programs = {name: program(*piece) for name, piece in pieces.items()}
-    programs |= {name: program(update, states[name]) for name, update in updates.items()}
+    for name, one in configs.items():
+        state = moment.state if name == "step" else stage1.init(scene, moment.clips, one)
+        programs[name] = program(stage1.make_update(scene, moment.clips, one, 1, 1), state)
     seconds = interleaved(programs, rounds)
+    report = {
+        "step_seconds": seconds["step"],
+        "step_temporary_mib": temporary_bytes(programs["step"]) / 2**20,
+        "contact_share": seconds["body and contact"] / seconds["step"],
+    }
+    if not whole:
+        return report
     best = timing.peaks(rounds)
     # a loop would be counted once: without loops, and so without anything recomputed in them
     plain = dataclasses.replace(config, model=dataclasses.replace(config.model, remat=False))
@@ -184,10 +193,7 @@ def step(experiment: Experiment, moment: Moment, rounds: int) -> dict:
         counted = {
             name: cost(program(*piece)) for name, piece in _pieces(experiment._replace(config=plain), moment).items()
         }
-    return {
-        "step_seconds": seconds["step"],
-        "step_temporary_mib": temporary_bytes(programs["step"]) / 2**20,
-        "contact_share": seconds["body and contact"] / seconds["step"],
+    return report | {
         "batch4_per_window_ratio": seconds["batch"] / BATCH / seconds["step"],
         "peaks": best,
         "pieces": {

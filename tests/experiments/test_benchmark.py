@@ -67,7 +67,8 @@ def test_the_parts_of_stage_1(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_the_parts_of_inference(tmp_path, monkeypatch):
     monkeypatch.setattr(inference, "one_thread", lambda: None)  # this process has other tests to run
-    main(["--part", "inference", "--quick", "--json", str(tmp_path / "b.json")])
+    monkeypatch.setattr(benchmark_report, "INFERENCE", {"rounds": 3, "frames": 20, "crowds": (1, 4)})
+    main(["--part", "inference", "--json", str(tmp_path / "b.json")])
     figures = json.loads((tmp_path / "b.json").read_text())["inference"]
     assert (tmp_path / "b.inference.png").exists()
     variants = {each["name"]: each for each in figures["variants"]}
