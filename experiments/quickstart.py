@@ -65,7 +65,7 @@ def main(argv: list[str]) -> None:
             **clock,
             "this_session_training_seconds": trained,
             "this_session_seconds": time.monotonic() - started,
-            # a few frames are left out: in one, a vertex between two faces of the body may be pushed by the other
+            # a few frames are left out: in one, rounding may decide whether an edge touches, and so moves its ends
             "onnx_error_mm": float(np.percentile(onnx_errors.max(axis=1), USUAL)),
             "onnx_worst_error_mm": float(onnx_errors.max()),
             "onnx_frames": len(part.rotations),

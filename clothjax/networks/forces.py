@@ -94,8 +94,8 @@ def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConf
         others = {name for kind in KINDS.values() for name in kind}.difference(names)
 
         def energy(new: Array) -> Array:
-            terms = incremental_potential.energies(new, step, mesh, config, LAWS, others)
-            return sum((terms[name] for name in names if name in terms), jnp.zeros(()))
+            terms = incremental_potential.elements(new, step, mesh, config, LAWS, others)
+            return sum((jnp.sum(terms[name]) for name in names if name in terms), jnp.zeros(()))
 
         return -jax.grad(energy)(position)
 

@@ -76,7 +76,10 @@ def _blank(latent: Array) -> _Iterate:
 
 
 def _step(last: _Iterate, objective: Objective, precondition: Precondition, bound: float) -> _Iterate:
-    """Try one step: take it if the energy falls enough, else try a shorter one next. It is the only evaluation."""
+    """Try one step: take it if the energy falls enough, else try a shorter one next.
+
+    The objective is evaluated nowhere else, so that a program has it once.
+    """
     tried = last.latent + last.share * last.direction
     energy, gradient = objective(tried)
     slope = last.share * jnp.sum(last.gradient * last.direction)

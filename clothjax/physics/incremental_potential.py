@@ -143,15 +143,10 @@ def self_collision(
 
 
 def energies(
-    new: Float[Array, "V 3"],
-    step: TimeStep,
-    mesh: Mesh,
-    config: PhysicsConfig,
-    laws: Laws = LAWS,
-    without: Collection[str] = (),
+    new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig, laws: Laws = LAWS
 ) -> dict[str, Array]:
-    """Evaluate the terms of the incremental potential, as `elements`, each a scalar in J."""
-    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws, without).items()}
+    """Evaluate the terms of the incremental potential at new positions [V, 3] m, each a scalar in J."""
+    return {name: jnp.sum(values) for name, values in elements(new, step, mesh, config, laws).items()}
 
 
 def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> Float[Array, ""]:
@@ -160,8 +155,8 @@ def potential(new: Float[Array, "V 3"], step: TimeStep, mesh: Mesh, config: Phys
     A time step of the cloth minimises it.
     """
     compiled = _in_kernels(new, step, mesh, config) if kernels.used(new) else {}
-    terms = energies(new, step, mesh, config, without=compiled)
-    return sum((terms | compiled).values())  # pyright: ignore[reportReturnType]  # there are terms
+    terms = elements(new, step, mesh, config, without=compiled) | compiled
+    return sum(map(jnp.sum, terms.values()))  # pyright: ignore[reportReturnType]  # there are terms
 
 
 def _in_kernels(new: Array, step: TimeStep, mesh: Mesh, config: PhysicsConfig) -> dict[str, Array]:

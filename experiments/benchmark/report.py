@@ -28,9 +28,10 @@ Errors are those of `clothjax evaluate`, in rollouts on motions held out of trai
 error of the velocity that skinning does not explain, over the solver's.
 
 `--quick` only checks that the parts run: a small Phi, few rounds and frames, one garment. It leaves out what needs
-programs of its own. Of `stage1` that is compilation, recomputed blocks, float64, batches, flops and bytes, the growth
-with vertices and the scenes. Of `inference` it is the paper's size and NCS, garments that rest, 4 000 vertices, parts
-of a garment and fewer blend shapes. Of `pareto` it is Phi of many steps, the solver stopped early and fewer shapes.
+programs of its own. Of `stage1` that is compilation, blocks that are not recomputed, float64, batches, flops and bytes,
+the growth with vertices and the scenes. Of `inference` it is the paper's size and NCS, garments that rest, 4 000
+vertices, parts of a garment and fewer blend shapes. Of `pareto` it is Phi of many steps, the solver stopped early and
+fewer shapes.
 
 `--compare OLD.json` sets the times of both reports side by side and flags ratios beyond the noise of both. For `pareto`
 it also tells whether both put the points in the same order (Kendall's tau).

@@ -44,8 +44,8 @@ def measure(config: Config, rounds: int, whole: bool = True) -> dict:
     """Measure a training step of a configuration whose body nodes take part in message passing.
 
     Args:
-        whole: False leaves out the time of compilation, recomputed blocks, the difference in float64, batches and the
-            flops and bytes of the pieces, which all need programs of their own.
+        whole: False leaves out the time of compilation, blocks that are not recomputed, the difference in float64,
+            batches and the flops and bytes of the pieces, which all need programs of their own.
     """
     experiment = assembly.assemble(config)
     moment = first_moment(experiment)
@@ -74,9 +74,12 @@ def processor(experiment: Experiment, moment: Moment, rounds: int, whole: bool) 
     forms = {"ours": passed, "textbook": textbook.process}
     arguments = (params, state.statistics, moment.first.seen)
     stored, recomputed = (dataclasses.replace(config.model, remat=remat) for remat in (False, True))
-    settings = {"ours": recomputed if whole else stored, "textbook": stored}
-    settings |= {"ours, nothing recomputed": stored} if whole else {}
-    programs = {name: program(loss(forms[name.split(",")[0]], one), *arguments) for name, one in settings.items()}
+    programs = {
+        "ours": program(loss(forms["ours"], recomputed), *arguments),
+        "textbook": program(loss(forms["textbook"], stored), *arguments),
+    }
+    if whole:
+        programs["ours, nothing recomputed"] = program(loss(forms["ours"], stored), *arguments)
     seconds = interleaved(programs, rounds)
     memory = {name: temporary_bytes(one) for name, one in programs.items()}
 

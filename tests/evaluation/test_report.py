@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -101,14 +102,25 @@ def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatc
 def test_trajectories_of_other_networks_are_refused(tmp_path, monkeypatch):
     """A run that was trained further since it was measured would be shown beside what it no longer does."""
     monkeypatch.chdir(tmp_path)
-    run, track = trained.find("tshirt_pose"), np.ones((2, 3, 3), np.float32)
+    run, track = trained.find("tshirt"), np.ones((2, 3, 3), np.float32)
     rollouts.output_folder(run).mkdir(parents=True)
     rollouts.Tracks({"lbs": track, "psi": 2 * track}, 3 * track).save(run, "walk_3", rollouts.networks(run))
-    found = rollouts.Tracks.load(run, "walk_3")
+    psi, (config, phi) = trained.psi(run), trained.network(run)
+
+    def load(psi=psi, phi=phi):
+        monkeypatch.setattr(trained, "psi", lambda _: psi)
+        monkeypatch.setattr(trained, "network", lambda _: (config, phi))
+        return rollouts.Tracks.load(run, "walk_3")
+
+    scales = psi.normalizers
+    # another machine computes other bits of the whitening, of the same networks
+    found = load(psi._replace(normalizers=scales._replace(whitening=jax.tree.map(lambda x: 2 * x, scales.whitening))))
     assert set(found.methods) == {"lbs", "psi"}
     np.testing.assert_array_equal([found.methods["psi"], found.solver], [2 * track, 3 * track])
-    predictor = trained.psi(run).predictor | {"more": np.zeros(1)}
-    again = trained.psi(run)._replace(predictor=predictor)
-    monkeypatch.setattr(trained, "psi", lambda run: again)
-    with pytest.raises(ValueError, match=r"trajectories_walk_3.npz: of other networks .* evaluate"):
-        rollouts.Tracks.load(run, "walk_3")
+    for other in (
+        {"psi": psi._replace(predictor=psi.predictor | {"more": np.zeros(1)})},
+        {"psi": psi._replace(normalizers=scales._replace(high=2 * scales.high))},
+        {"phi": phi | {"more": np.zeros(1)}},
+    ):
+        with pytest.raises(ValueError, match=r"trajectories_walk_3.npz: of other networks .* evaluate"):
+            load(**other)
