@@ -92,6 +92,28 @@ def test_a_descent_stays_at_a_code_without_energy_and_where_it_is_worse(coded, f
         np.testing.assert_array_equal(descend(inverse, START, decode, energy, steps), START)
 
 
+@pytest.mark.parametrize("tolerance", [0.1, 1e-3, 0.0])
+def test_a_descent_converges_where_little_is_left_of_what_was_gained(tolerance):
+    """It takes the steps of `descend`, and counts them from the first energy on."""
+    weights = jnp.array([1.0, 30.0, 400.0])
+
+    def potential(x):
+        return 0.5 * jnp.sum(weights * (x - GOAL) ** 2)
+
+    settings = (lambda g: g / 20, START, lambda code: code, potential)
+    end, count = descent.converge(*settings, steps=9, bound=1e6, tolerance=tolerance)
+    np.testing.assert_allclose(end, descent.descend(*settings, int(count), 1e6), rtol=1e-6)
+    step = jax.jit(lambda at: descent._step(at, jax.value_and_grad(potential), settings[0], 1e6))
+    at, expected = step(descent._blank(START)), 0
+    first = at.energy
+    while expected < 9:
+        left = -0.5 * float(at.gradient @ at.direction)
+        if expected >= 2 and left <= tolerance * float(first - at.energy + 0.01):
+            break
+        at, expected = step(at), expected + 1
+    assert int(count) == expected and (tolerance > 0) == (expected < 9)
+
+
 @pytest.mark.parametrize("known, newest", [(0, 0), (1, 1), (5, 3), (5, 20), (descent.MEMORY, 7)])
 def test_the_direction_is_that_of_dense_bfgs(known, newest):
     """Against the update of the whole inverse Hessian, oldest step first, begun with the scaled preconditioner."""
