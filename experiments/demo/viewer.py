@@ -1,7 +1,7 @@
 """Steer a character, dressed by Psi, live in the browser.
 
     python -m experiments.demo                                      # or: make demo
-    python -m experiments.demo dress --port 8080
+    python -m experiments.demo dress_fine --port 8080
     python -m experiments.demo runs/my_skirt --motions clips/*.motion.h5
 
 Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the

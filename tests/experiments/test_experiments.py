@@ -162,7 +162,7 @@ def test_a_run_is_packed_and_used_by_its_name(finished, tmp_path, monkeypatch):
 def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, monkeypatch):
     measured = json.loads((finished / "report.json").read_text())
     measured = measured["evaluation"] | {name: measured[name] for name in ("motions", "pushed", "garment")}
-    measured["wearers"] = json.loads((trained.find("dress") / trained.REPORT).read_text())["wearers"]
+    measured["wearers"] = json.loads((trained.find("skirt") / trained.REPORT).read_text())["wearers"]
     monkeypatch.setattr(trained, "MODELS", tmp_path)
     given = []
 

@@ -101,7 +101,7 @@ def test_the_entry_runs_a_command(tmp_path):
         ("clothjax convert", ["skirt", "--max_influences", "4"], "--max-influences"),
         ("clothjax train", ["configs/quickstart.yaml", "--motion", "walk_0"], "--motions"),
         ("experiments.gallery", ["--pretrained", "skirt", "--out", "a.png"], cli.MODEL),
-        ("experiments.demo", ["--garment", "dress"], cli.MODEL),
+        ("experiments.demo", ["--garment", "skirt"], cli.MODEL),
         ("experiments.demo", ["--run", "runs/mine"], cli.MODEL),
         ("experiments.demo", ["--no_browser"], "--no-browser"),
         ("experiments.stability", ["--run", "runs/mine"], cli.MODEL),

@@ -366,7 +366,7 @@ def test_three_js_shows_what_the_runtime_shows(tmp_path, run, clip):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("garment", ["dress", "pants", "tshirt"])
+@pytest.mark.parametrize("garment", ["skirt", "tshirt"])
 def test_every_garment_in_a_run(tmp_path, garment):
     """Also how far from singular the transforms are that are undone."""
     run = trained.find(garment)

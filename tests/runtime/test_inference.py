@@ -113,7 +113,7 @@ def test_a_garment_that_nobody_sees_goes_on(trained):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), seen, unseen)
 
 
-@pytest.mark.parametrize("name", ["tshirt", "tshirt_pose", *slowly("dress", "pants", "skirt")])
+@pytest.mark.parametrize("name", ["tshirt", "tshirt_pose", *slowly("skirt")])
 def test_a_garment_at_rest_can_be_left_alone(name):
     model = loading.load(name)
     clip = storage.load_motion("walk_3", model.names)
