@@ -17,7 +17,7 @@ from clothjax.files import checkpoint, configuration, storage
 from clothjax.networks import normalisation
 from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
-from clothjax.training import pipeline
+from clothjax.training import pipeline, preconditioner
 from clothjax.types import Motion
 from experiments import evaluate, gallery, model_card, quickstart, render, ship, tune
 from experiments.stability import rollouts as stability_rollouts
@@ -52,6 +52,7 @@ def finished(tmp_path_factory):
     directory = tmp_path_factory.mktemp("runs") / "toy"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measures, "CHARACTERS_GAPS", 1)  # steps of the solver, which are the longest of all
+        patch.setattr(preconditioner, "FRAMES", 3)
         patch.setattr(measures, "PUSHES", {"gust": measures.PUSHES["gust"]})
         quickstart.main([*TOY, "--directory", str(directory)])
     return directory

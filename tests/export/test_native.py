@@ -546,7 +546,7 @@ def test_c_has_the_constants_of_the_search():
     assert places >= 2 * patch and places & (places - 1) == 0
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [24, pytest.param(5000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("forces", [False, True])
 def test_a_damaged_file_is_refused_or_plays_on(forces, count, motion, tmp_path):
     program = made(tmp_path, *SANITIZERS)
