@@ -113,6 +113,7 @@ def main(args: Arguments) -> None:
     save_garment(
         args.output,
         garment,
+        names,
         name=args.output.stem,
         body=Path(args.body).stem,
         source=source,

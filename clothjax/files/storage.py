@@ -13,6 +13,7 @@ Body, `format` "clothjax/body":
 Garment, `format` "clothjax/garment", attribute `body`, the name of the body it is aligned with:
     vertices [V, 3]; faces [F, 3] int32; weights_index [V, n] int16 and weights_value [V, n];
     shapedirs [V, 3, S]; pin [V] bool, the vertices that follow skinning;
+    optional joint_names [J] strings, the body's;
     optional cloth [V, 3]: factors of the material's density, of its mu and lam, and of its bending.
 Motion, `format` "clothjax/motion", attribute `fps` float64:
     poses [T, J, 3], axis-angle in radians, local to the parent; zero is the body's canonical pose;
@@ -109,13 +110,21 @@ def load_rig(path: str | Path) -> Rig:
         return Rig(body, file.texts("joint_names", ("J",)))
 
 
-def load_garment(path: str | Path, body: Body) -> Garment:
+def load_garment(path: str | Path, body: Body, joint_names: Sequence[str] | None = None) -> Garment:
     """Read the garment in a file (or embedded), made for `body`.
+
+    Args:
+        path: of the file.
+        body: that wears it.
+        joint_names: the body's; the garment must have the same in the same order, if its file has any.
 
     Raises:
         ValueError: naming the file, the dataset and the first wrong entry; or if the body is far away.
     """
     with hdf5.reading(asset(path), "garment") as file:
+        if joint_names is not None and "joint_names" in file:
+            remedy = "make it for this body (data_prep.garment --body)"
+            _check_joints(file, "garment", file.texts("joint_names", ("names",)), joint_names, remedy)
         file.sizes.update(J=len(body.parents), S=np.shape(body.shapedirs)[-1])
         vertices = file.floats("vertices", ("V", 3))
         _check_size(file, "largest extent of the garment", np.ptp(vertices, axis=0).max(), 0.05, 3.0)
@@ -160,8 +169,8 @@ def load_motion(path: str | Path, joint_names: Sequence[str] | None = None) -> M
             height = np.median(np.abs(translation[:, 1]))
             file.fail(f"root height {height:.0f} m looks like centimetres: divide by 100")
         names = file.texts("joint_names", ("J",))
-        if joint_names is not None and names != tuple(joint_names):
-            _refuse_joints(file, names, tuple(joint_names))
+        if joint_names is not None:
+            _check_joints(file, "motion", names, joint_names, "retarget it (data_prep)")
         rotations = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
         return Motion(rotations.astype(np.float32), translation, float(fps))
 
@@ -222,10 +231,13 @@ def save_body(
     hdf5.write(path, "body", data, name=name, source=source, licence=licence)
 
 
-def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, source: str, licence: str) -> None:
+def save_garment(
+    path: str | Path, garment: Garment, joint_names: Sequence[str], *, name: str, body: str, source: str, licence: str
+) -> None:
     """Write a garment as HDF5, completely or not at all.
 
     Args:
+        joint_names: [J] strings, the body's.
         body: name of the body that it was made for.
         name, source, licence: attributes of the file.
     """
@@ -235,6 +247,7 @@ def save_garment(path: str | Path, garment: Garment, *, name: str, body: str, so
         **_sparse(garment.weights),
         "shapedirs": np.float32(garment.shapedirs),
         "pin": np.asarray(garment.pinned, bool),
+        "joint_names": hdf5.encoded(joint_names),
     }
     if garment.cloth is not None:
         data["cloth"] = np.float32(garment.cloth)
@@ -344,9 +357,10 @@ def _check_size(file: Reader, what: str, size: float, low: float, high: float) -
     file.fail(f"{what} is {size:g} m, allowed {low} to {high}")
 
 
-def _refuse_joints(file: Reader, names: tuple[str, ...], wanted: tuple[str, ...]) -> None:
-    """Raise a ValueError that lists how the joints of a motion differ from the body's."""
+def _check_joints(file: Reader, kind: str, names: tuple[str, ...], wanted: Sequence[str], remedy: str) -> None:
+    """Raise a ValueError that lists how the joints of a motion or a garment differ from the body's, if they do."""
     lacking = [n for n in wanted if n not in names]
     further = [n for n in names if n not in wanted]
-    text = f"lacks {lacking} and also has {further}" if lacking or further else f"has another order, {list(names)}"
-    file.fail(f"joints differ from the body's: the motion {text}; retarget it (data_prep)")
+    if names != tuple(wanted):
+        text = f"lacks {lacking} and also has {further}" if lacking or further else f"has another order, {list(names)}"
+        file.fail(f"joints differ from the body's: the {kind} {text}; {remedy}")

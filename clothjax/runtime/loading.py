@@ -268,8 +268,8 @@ def load(
     """
     config, decoder, predictor, normalizers = trained.psi(trained.find(run))
     body, names = storage.load_rig(config.body)
-    garment = storage.load_garment(config.garment, body)
-    felt = storage.load_garment(config.model.felt, body) if config.model.felt else None
+    garment = storage.load_garment(config.garment, body, names)
+    felt = storage.load_garment(config.model.felt, body, names) if config.model.felt else None
     if coarse:
         if felt is None:
             raise ValueError(f"{run}: has no coarse mesh: it was trained without model.felt")

@@ -36,8 +36,8 @@ def assemble(config: Config) -> Experiment:
         ValueError: for a file that is missing or wrong, or a garment and a body that do not fit.
     """
     body, names = storage.load_rig(config.body)
-    garment = storage.load_garment(config.garment, body)
-    felt = storage.load_garment(config.model.felt, body) if config.model.felt else None
+    garment = storage.load_garment(config.garment, body, names)
+    felt = storage.load_garment(config.model.felt, body, names) if config.model.felt else None
     return Experiment(config, names, body, garment, scene.build_scene(garment, body, config, felt))
 
 

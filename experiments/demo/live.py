@@ -42,7 +42,7 @@ class Outfit:
         model = loading.load(run, betas=betas, material=material)
         if fine and (garment := finer(model.config)):
             body = storage.load_body(model.config.body)
-            model = specialise.on_mesh(model, storage.load_garment(garment, body), betas)
+            model = specialise.on_mesh(model, storage.load_garment(garment, body, model.names), betas)
         self.model, self.count = model, count
         self._crowd = loading.crowd([model] * count)
         self._states = None

@@ -42,7 +42,7 @@ def seeds(tmp_path_factory):
     for path in (paths["body.h5"], paths["garment.h5"].parent / "whole.body.h5"):
         storage.save_body(path, body, NAMES, name="b", **about)
     garment = two_faces(body)._replace(cloth=np.ones((4, 3)))
-    storage.save_garment(paths["garment.h5"], garment, name="g", body="b", **about)
+    storage.save_garment(paths["garment.h5"], garment, NAMES, name="g", body="b", **about)
     storage.save_motion(paths["motion.h5"], spin(), NAMES, name="m", **about)
     np.savez(paths["take.npz"], **recording(frames=9))
     arrays = smpl_arrays()

@@ -34,7 +34,7 @@ def test_body_round_trip(tmp_path, posed):
 def test_a_vertex_without_a_face_is_refused(tmp_path):
     body = _body()
     garment = _garment(body)._replace(faces=np.array([[0, 1, 2]], np.int32))
-    storage.save_garment(tmp_path / "g.h5", garment, name="g", body="b", source="test", licence="CC0-1.0")
+    storage.save_garment(tmp_path / "g.h5", garment, "abc", name="g", body="b", source="test", licence="CC0-1.0")
     with pytest.raises(ValueError, match=r"g\.h5: vertex 3 has no face"):
         storage.load_garment(tmp_path / "g.h5", body)
 
@@ -43,7 +43,7 @@ def test_a_vertex_without_a_face_is_refused(tmp_path):
 def test_garment_round_trip(tmp_path, cloth):
     body = _body()
     garment = _garment(body)._replace(cloth=cloth)
-    storage.save_garment(tmp_path / "g.h5", garment, name="g", body="b", source="test", licence="CC0-1.0")
+    storage.save_garment(tmp_path / "g.h5", garment, "abc", name="g", body="b", source="test", licence="CC0-1.0")
     loaded = storage.load_garment(tmp_path / "g.h5", body)
     assert (loaded.cloth is None) == (cloth is None)
     for wanted, found in zip(garment, loaded):
@@ -167,9 +167,29 @@ def test_failed_write_leaves_the_old_file(tmp_path):
 def test_garment_that_does_not_fit_its_body(tmp_path, change, word):
     body = _body()
     path = tmp_path / "g.h5"
-    storage.save_garment(path, change(_garment(body)), name="g", body="b", source="test", licence="CC0-1.0")
+    storage.save_garment(path, change(_garment(body)), "abc", name="g", body="b", source="test", licence="CC0-1.0")
     with pytest.raises(ValueError, match=word):
         storage.load_garment(path, body)
+
+
+@pytest.mark.parametrize(
+    "names, words",
+    [
+        ("ab", r"garment lacks \['c'\] and also has \[\]"),
+        ("bac", "garment has another order"),
+        (None, None),  # as files of before
+    ],
+)
+def test_a_garment_of_another_skeleton_is_refused(tmp_path, names, words):
+    body, path = _body(), tmp_path / "g.h5"
+    storage.save_garment(path, _garment(body), names or "abc", name="g", body="b", source="test", licence="CC0-1.0")
+    if words is None:
+        _edit(path, "joint_names")
+        storage.load_garment(path, body, "abc")
+    else:
+        storage.load_garment(path, body)  # whose names nobody knows
+        with pytest.raises(ValueError, match=words):
+            storage.load_garment(path, body, "abc")
 
 
 @pytest.mark.parametrize(
