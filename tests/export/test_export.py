@@ -545,8 +545,8 @@ def test_safetensors_of_forces_of_older_formats_are_refused(forced, tmp_path):
             safetensors.from_safetensors(tmp_path / "old.safetensors")
 
 
-def test_safetensors_of_forces_that_relax_hold_the_mobility(forced, tmp_path):
-    for name in ("relaxed", "coarse"):
+def test_safetensors_of_forces_hold_all_that_a_model_has(forced, tmp_path):
+    for name in ("mesh", "relaxed", "coarse"):
         path = safetensors.to_safetensors(forced[name], tmp_path / f"{name}.safetensors")
         assert_same(safetensors.from_safetensors(path), forced[name])
     path = safetensors.to_safetensors(forced["relaxed"], tmp_path / "relaxed.safetensors")
