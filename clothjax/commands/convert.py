@@ -12,9 +12,9 @@
     c             plain C without any runtime, in eight bits: psi.c and psi.h come with it
     safetensors   the arrays alone, for those who build a runtime
 
-A JSON beside the file tells an engine how to drive it. The model is specialised first, by
-`clothjax/runtime/specialise.py`. The distance of vertices to jax's unspecialised model over a rollout of 300 frames is
-printed and written to the JSON.
+A JSON beside the file tells an engine how to drive it: skirt.json of skirt.onnx, skirt.psi.json of skirt.psi and so on.
+The model is specialised first, by `clothjax/runtime/specialise.py`. The distance of vertices to jax's unspecialised
+model over a rollout of 300 frames is printed and written to the JSON.
 """
 
 from pathlib import Path

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from clothjax.export import litert, native, onnx, safetensors, stablehlo
+from clothjax.export import litert, native, onnx, safetensors, sidecar, stablehlo
 from clothjax.export.sidecar import Output
 from clothjax.physics import compilers
 from clothjax.runtime import inference, specialise
@@ -125,7 +125,7 @@ def export(model: Model, name: str, out: Path, options: Options, about: dict, mo
         return None
     apart = 1e3 * np.linalg.norm(vertices - np.asarray(inference.animate(model, motion)[0]), axis=-1)
     error = {"frames": len(vertices), "mean_mm": float(apart.mean()), "max_mm": float(apart.max())}
-    description = out.with_suffix(".json")
+    description = sidecar.beside(out)
     if form.described and description.is_file():
         entries = json.loads(description.read_text())
         description.write_text(json.dumps(entries | {"distance_to_jax": error}))

@@ -30,8 +30,13 @@ STATE_WITH_FORCES = {
 }
 
 
+def beside(path: Path) -> Path:
+    """Return the JSON's path: skirt.json of skirt.onnx, else such as skirt.psi.json, so that no two share it."""
+    return path.with_suffix(".json") if path.suffix == ".onnx" else path.with_name(f"{path.name}.json")
+
+
 def write(model: Model, path: Path, output: Output, about: dict) -> None:
-    """Write the JSON beside the file of an exported model: `path` with the suffix .json.
+    """Write the JSON beside the file of an exported model.
 
     Args:
         output: what vertices the file computes.
@@ -56,4 +61,4 @@ def write(model: Model, path: Path, output: Output, about: dict) -> None:
         entries["skin_joints"] = list(model.moving)
         entries["skin_weights"] = np.round(np.asarray(model.network.weights).T, 5).tolist()
         entries["joint_positions"] = np.asarray(model.wearer.joints).tolist()
-    path.with_suffix(".json").write_text(json.dumps(entries))
+    beside(path).write_text(json.dumps(entries))

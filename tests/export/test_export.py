@@ -18,7 +18,7 @@ from toy import assert_same, small
 
 from clothjax.body import skinning
 from clothjax.commands import convert
-from clothjax.export import formats, frame, litert, onnx, onnx_drape, onnx_forces, safetensors, stablehlo
+from clothjax.export import formats, frame, litert, native, onnx, onnx_drape, onnx_forces, safetensors, stablehlo
 from clothjax.export.onnx_graph import Graph, session
 from clothjax.files import storage
 from clothjax.geometry import clusters
@@ -89,6 +89,15 @@ def test_onnx_holds_codes_to_their_range_and_says_so(model, motion, tmp_path):
         np.testing.assert_allclose(latent[0], expected.latent, atol=1e-4)
         assert bool(ok[0]) == bool(expected.ok) == fine
     assert np.abs(session(tmp_path / "strict.onnx").run(["next_latent"], feed)[0]).max() <= 0.2 + 1e-6
+
+
+def test_formats_of_one_name_leave_each_other_their_json(model, tmp_path):
+    told = {}
+    for ending, write in (("json", onnx.to_onnx), ("psi.json", native.to_c)):
+        write(model, tmp_path / ("g.onnx" if write is onnx.to_onnx else "g.psi"))
+        told[ending] = (tmp_path / f"g.{ending}").read_text()
+    assert "next_latent" in told["json"] and "psi.h" in told["psi.json"]
+    assert all((tmp_path / f"g.{ending}").read_text() == text for ending, text in told.items())
 
 
 def test_int8_is_small_and_near(model, motion, tmp_path):
@@ -246,7 +255,7 @@ def test_litert_agrees_over_300_frames(model, tmp_path):
         out = tmp_path / "t.tflite"
         command = [python, "-m", "clothjax", "convert", "tshirt_pose", "--to", "litert", "--out", out, *int8]
         subprocess.run(command, check=True, cwd=root)
-        told = json.loads(out.with_suffix(".json").read_text())
+        told = json.loads((tmp_path / "t.tflite.json").read_text())
         assert told["distance_to_jax"]["frames"] == 300 and 0 < told["distance_to_jax"]["max_mm"] < most
         assert told["results"][-1] == "vertices" and told["arguments"]["translation"] == [3]
 
@@ -529,7 +538,7 @@ def test_other_formats_of_forces_are_the_model(forced, motion, tmp_path):
         assert apart(stablehlo.run_stablehlo(path, model, clip), model, clip).max() < 1e-4
         again = safetensors.from_safetensors(safetensors.to_safetensors(model, tmp_path / "g.safetensors"))
         assert_same(again, model)
-        about = json.loads((tmp_path / "g.json").read_text())
+        about = json.loads((tmp_path / "g.shlo.json").read_text())
         assert about["arguments"]["external"] == [3] and len(about["results"]) == 11
 
 
