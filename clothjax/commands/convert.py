@@ -2,7 +2,7 @@
 
     python -m clothjax convert runs/quickstart --to onnx --int8
     python -m clothjax convert skirt --to stablehlo --out skirt.stablehlo
-    python -m clothjax convert dress --to c --out engine/dress.psi
+    python -m clothjax convert dress_fine --to c --out engine/dress.psi
     python -m clothjax convert tshirt --to onnx --batch dynamic --blendshapes 192 --betas 1 0 -0.5
 
     onnx          ONNX Runtime 1.15 and newer, and engines built on it. --int8 writes eight bits; --output canonical

@@ -48,6 +48,12 @@ def test_help_shows_an_example(program, capsys):
     assert not [flag for flag in flags if "_" in flag] and "--motion" not in flags
 
 
+def test_the_examples_name_garments_that_come_with_the_library():
+    pattern = r"(?m)^    python -m clothjax (?:convert|evaluate|render) ([^\s/]+)(?: |$)"
+    named = {name for module in MODULES.values() for name in re.findall(pattern, module.__doc__ or "")}
+    assert named and named <= {"all", *trained.shipped()}
+
+
 @pytest.mark.parametrize("name", ["amass", "anny", "asf_amc", "bvh", "garment", "procedural", "smpl"])
 def test_help_of_the_preparation_of_data_shows_an_example(name, capsys):
     module = importlib.import_module(f"data_prep.{name}")
