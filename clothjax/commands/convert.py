@@ -14,7 +14,7 @@
 
 A JSON beside the file tells an engine how to drive it: skirt.json of skirt.onnx, skirt.psi.json of skirt.psi and so on.
 The model is specialised first, by `clothjax/runtime/specialise.py`. The distance of vertices to jax's unspecialised
-model over a rollout of 300 frames is printed and written to the JSON.
+model over a rollout of 300 frames is printed and written to the JSON, if a motion fits its joints and rate.
 """
 
 from pathlib import Path
@@ -70,10 +70,14 @@ def main(argv: list[str]) -> None:
         default = Path(f"{arguments.model}{'_coarse' if arguments.coarse else ''}.{form.suffix}")
     out = arguments.out or default
     about = {"betas": arguments.betas or "the mean body", "material": arguments.material or "as configured"}
-    error = formats.export(model, arguments.to, out, options, about, validation(model))
+    try:
+        motion, not_run = validation(model), form.not_run
+    except ValueError as reason:
+        motion, not_run = None, str(reason)
+    error = formats.export(model, arguments.to, out, options, about, motion)
     print(f"written to {out}: {out.stat().st_size / 1e6:.2f} MB")
     if error is None:
-        print(f"not compared: {form.not_run}")
+        print(f"not compared: {not_run}")
     else:
         print(
             f"over {error['frames']} frames of autoregressive rollout: {error['mean_mm']:.4f} mm on average, "
@@ -87,8 +91,20 @@ def _batch(given: str) -> int | None:
 
 
 def validation(model: Model) -> Motion:
-    """Return the first validation motion that is present, for FRAMES frames."""
-    names = [name for name in model.config.evaluation.motions if storage.asset(name).is_file()]
-    clip = storage.load_motion(names[0] if names else "walk_3", model.names)
-    clip = assembly.there_and_back(clip, FRAMES)
-    return Motion(clip.rotations, np.asarray(clip.translation - clip.translation[:1], np.float32), clip.fps)
+    """Return the first validation motion that is there and fits, or else the embedded walk, for FRAMES frames.
+
+    Raises:
+        ValueError: if none fits the joints and the rate of the model, with the reasons.
+    """
+    reasons, fps = [], model.config.fps
+    for name in dict.fromkeys((*model.config.evaluation.motions, "walk_3")):
+        try:
+            clip = storage.load_motion(name, model.names)
+            if abs(clip.fps - fps) > 1e-3:
+                raise ValueError(f"{name} has {clip.fps:g} frames a second, the model {fps:g}")
+        except ValueError as error:
+            reasons.append(str(error))
+        else:
+            clip = assembly.there_and_back(clip, FRAMES)
+            return Motion(clip.rotations, np.asarray(clip.translation - clip.translation[:1], np.float32), clip.fps)
+    raise ValueError("; ".join(reasons))

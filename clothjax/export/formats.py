@@ -103,25 +103,25 @@ def check(name: str, options: Options) -> None:
             raise ValueError(f"--{option} is of {of}, not of {name}")
 
 
-def export(model: Model, name: str, out: Path, options: Options, about: dict, motion: Motion) -> dict | None:
+def export(model: Model, name: str, out: Path, options: Options, about: dict, motion: Motion | None) -> dict | None:
     """Write a specialised model with its JSON, and compare it to jax's unspecialised one.
 
     Args:
         name: of the format.
         about: more entries for the JSON.
-        motion: to compare over.
+        motion: to compare over; None to compare nothing.
 
     Returns:
         The `frames` of the rollout, and the mean and maximal distance of vertices, `mean_mm` and `max_mm`; None if the
-        file cannot be run here.
+        file is not compared, or cannot be run here.
     """
     check(name, options)
     form = FORMATS[name]
     small = specialise.specialise(model, blendshapes=options.blendshapes, max_influences=options.max_influences)
     out.parent.mkdir(parents=True, exist_ok=True)
     form.write(small, out, options, about)
-    vertices = form.run(out, small, motion, options)
-    if vertices is None:
+    vertices = None if motion is None else form.run(out, small, motion, options)
+    if motion is None or vertices is None:
         return None
     apart = 1e3 * np.linalg.norm(vertices - np.asarray(inference.animate(model, motion)[0]), axis=-1)
     error = {"frames": len(vertices), "mean_mm": float(apart.mean()), "max_mm": float(apart.max())}

@@ -580,6 +580,18 @@ def test_convert_says_how_far_it_is(tmp_path, capsys, monkeypatch):
         convert.main(["skirt", "--to", "c", "--batch", "3"])
 
 
+def test_convert_writes_what_no_motion_fits_and_says_so(model, tmp_path, capsys, monkeypatch):
+    """As of a character whose joints have other names than those of the embedded motions."""
+    fast = dataclasses.replace(model, config=dataclasses.replace(model.config, fps=60.0))
+    with pytest.raises(ValueError, match="walk_3 has 30 frames a second, the model 60"):
+        convert.validation(fast)
+    other = dataclasses.replace(model, names=tuple(f"mixamorig:{name}" for name in model.names))
+    monkeypatch.setattr(convert.loading, "load", lambda *_, **__: other)
+    convert.main(["tshirt_pose", "--to", "c", "--out", str(tmp_path / "g.psi")])
+    assert "not compared: " in (said := capsys.readouterr().out) and "joints differ from the body's" in said
+    assert "mixamorig:Hips" in (tmp_path / "g.psi.json").read_text() and (tmp_path / "g.psi").stat().st_size > 1e6
+
+
 def test_what_is_not_installed_is_said(model, monkeypatch, tmp_path):
     for package, write, ending in (
         ("onnx", onnx.to_onnx, "onnx"),
