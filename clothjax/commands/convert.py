@@ -17,6 +17,7 @@ The model is specialised first, by `clothjax/runtime/specialise.py`. The distanc
 model over a rollout of 300 frames is printed and written to the JSON, if a motion fits its joints and rate.
 """
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +87,16 @@ def main(argv: list[str]) -> None:
 
 
 def _batch(given: str) -> int | None:
-    """Return the number of characters a call, None for any number."""
-    return None if given == "dynamic" else int(given)
+    """Return the number of characters a call, None for any number.
+
+    Raises:
+        ArgumentTypeError: for anything else.
+    """
+    if given == "dynamic":
+        return None
+    if not given.isdecimal() or int(given) < 1:
+        raise argparse.ArgumentTypeError(f"{given!r} is neither a number from 1 nor `dynamic`")
+    return int(given)
 
 
 def validation(model: Model) -> Motion:

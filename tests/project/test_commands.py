@@ -96,6 +96,13 @@ def test_the_entry_runs_a_command(tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize("batch", ["0", "-2", "many"])
+def test_a_batch_that_is_no_number_of_characters_is_refused(batch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        MODULES["clothjax convert"].main(["no_such_garment", "--batch", batch])
+    assert ended.value.code == 2 and f"{batch!r} is neither a number from 1 nor" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "program, argv, new",
     [
