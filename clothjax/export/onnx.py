@@ -115,10 +115,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         turned = g("Sub", g.slice(pose, 2, 0, 9 * count), g.slice(last, 2, 0, 9 * count))
         shown = output == "world"
         code, touched = onnx_drape.next_code(g, model, rows, transforms, advance, turned, shown)
-        low, high = (np.asarray(x) for x in network.code_bounds[:2])
-        whole = g("Where", g("IsNaN", code), 0.5 * (low + high), code)
-        latent, _ = g.within(whole, low, high, name="next_latent")
-        strayed = g("Abs", g("Sub", latent, code))  # NaN is not within the slack
+        latent, strayed = g.within(code, *network.code_bounds[:2], name="next_latent")
         sound = g("And", sound, g("Unsqueeze", onnx_forces.pushed(g), np.array([1], np.int64)))
     else:
         inputs, order = _inputs(g, frames, last, joints[model.input_joints[0]], model)
@@ -128,7 +125,7 @@ def _frame(model: Model, batch: int | str, int8: bool, output: Output) -> tuple[
         latent, strayed = predicted(g, inputs, model, order)
         slack = np.concatenate([np.asarray(bounds.slack)[order], slack])
         strayed = g("Concat", moved, strayed, axis=1)
-    fine = g.all(g("LessOrEqual", strayed, slack), axis=1)
+    fine = g.all(g("LessOrEqual", strayed, slack), axis=1)  # NaN is not within the slack
     known = np.array([[bool(wearer.known)]])
     ok = g("And", g("And", fine, known), g("Reshape", sound, np.array([-1, 1], np.int64)))
     g("Reshape", ok, np.array([-1], np.int64), name="ok")

@@ -59,8 +59,10 @@ class Graph:
         return self("Slice", x, *(np.array([i], np.int64) for i in (start, end, axis)), name=name)
 
     def within(self, x: str, low: Array, high: Array, name: str | None = None) -> tuple[str, str]:
-        """Clip x to [low, high]; return it and the distance by which it was clipped."""
-        inside = self("Min", self("Max", x, np.asarray(low)), np.asarray(high), name=name)
+        """Clip x to [low, high], NaN to the middle; return it and how far it was clipped, of NaN NaN."""
+        low, high = np.asarray(low), np.asarray(high)
+        whole = self("Where", self("IsNaN", x), 0.5 * (low + high), x)
+        inside = self("Min", self("Max", whole, low), high, name=name)
         return inside, self("Abs", self("Sub", inside, x))
 
     def layer(self, x: str, layer: Layer) -> str:

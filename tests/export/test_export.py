@@ -65,14 +65,17 @@ def test_onnx_takes_wild_input_as_the_model_does(model, motion, tmp_path):
     state = inference.initial_state(model, Pose(rotations[0], translation[0]))
     tensors = onnx.first_state(model, Pose(rotations[0], translation[0]))
     told = []
-    for turn, place in zip(rotations, translation):
+    for t, (turn, place) in enumerate(zip(rotations, translation)):
+        if t == 2:  # an engine gave back a damaged state
+            tensors[0] = np.where(np.arange(tensors[0].size) % 3, tensors[0], np.float32(np.nan))
+            state = state._replace(latent=jnp.asarray(tensors[0][0]))
         state, vertices = inference.step(model, state, Pose(jnp.asarray(turn), jnp.asarray(place)))
         feed = dict(zip(onnx.INPUTS, (*tensors, turn[None], place[None])))
         *tensors, ok, shown = run.run([*onnx.FOLLOWING, "vertices"], feed)
         np.testing.assert_allclose(shown[0], vertices, atol=1e-4)
         assert ok.shape == (1,) and bool(ok[0]) == bool(state.ok)
         told.append(bool(ok[0]))
-    assert not told[4] and not told[7] and not told[9] and any(told)
+    assert not told[2] and not told[4] and not told[7] and not told[9] and any(told)
 
 
 def test_onnx_holds_codes_to_their_range_and_says_so(model, motion, tmp_path):
