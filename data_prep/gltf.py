@@ -27,26 +27,30 @@ from data_prep.retarget import relative, stand
 STRETCHED = 0.01  # m, by which a joint may be elsewhere than the animation has it
 
 
-def motions(character: Character, fps: float) -> tuple[dict[str, Motion], list[str]]:
-    """Return the animations of a character's file as motions of its body, by name, and what of them is left out.
+def motions(character: Character, fps: float) -> tuple[dict[str, Motion], list[str], list[str]]:
+    """Return the animations of a character's file as motions of its body, by name.
 
     Args:
         character: of `read`.
         fps: frames a second.
 
-    Raises:
-        ValueError: naming the file, if they are damaged.
+    Returns:
+        The motions, what is to be told of them, and an error that names file and animation for each damaged one.
     """
-    found, log = {}, []
+    found, log, failed = {}, [], []
     for number, animation in enumerate(character.document.entries("animations")):
         name = re.sub(r"[^A-Za-z0-9._-]+", "_", animation.get("name") or f"animation_{number}").strip("_.")
         name = f"{name}_{number}" if name in found or not name else name
-        with naming(f"{character.document.path}, animation {name}"):
-            motion, told = _motion(character, number, fps)
+        try:
+            with naming(f"{character.document.path}, animation {name}"):
+                motion, told = _motion(character, number, fps)
+        except ValueError as error:
+            failed.append(str(error))
+            continue
         log += [f"animation {name}: {line}" for line in told]
         if motion is not None:
             found[name] = motion
-    return found, log
+    return found, log, failed
 
 
 def _motion(character: Character, number: int, fps: float) -> tuple[Motion | None, list[str]]:
@@ -85,7 +89,11 @@ class Arguments(OutputOptions):
 
 
 def main(args: Arguments) -> None:
-    """Write the body file and the motion files, and print what was done."""
+    """Write the body file and the motion files, and print what was done.
+
+    Raises:
+        ValueError: for a character that is refused; after all other animations, naming those that are.
+    """
     character = read(args.character, args.object, args.shapes, args.joints, args.units)
     body, names = character.rig
     save_body(
@@ -103,10 +111,15 @@ def main(args: Arguments) -> None:
     surface = ray_cast.Surface(np.asarray(body.vertices), np.asarray(body.faces), ray_cast.SKIN)
     draw(args.output.with_suffix(".body.png"), [surface], np.asarray(body.vertices), 1.2)
     if args.motions is not None:
-        found, log = motions(character, args.fps)
+        found, log, failed = motions(character, args.fps)
         print("\n".join(f"{args.character}: {line}" for line in log or [f"{len(found)} animations"]))
         for name, motion in found.items():
-            write_motion(args.motions / f"{name}.h5", motion, character.rig, Path(name), args)
+            try:
+                write_motion(args.motions / f"{name}.h5", motion, character.rig, args.character, args, name)
+            except ValueError as error:
+                failed.append(str(error))
+        if failed:
+            raise ValueError(f"{len(failed)} of the animations are not written: {'; '.join(failed)}")
 
 
 if __name__ == "__main__":

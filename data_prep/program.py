@@ -146,7 +146,9 @@ def draw(path: Path, surfaces: list[ray_cast.Surface], around: np.ndarray, margi
         print(f"{path}: not drawn ({error})")
 
 
-def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, options: OutputOptions) -> int:
+def write_motion(
+    output: Path, motion: Motion, rig: Rig, recording: Path, options: OutputOptions, animation: str = ""
+) -> int:
     """Treat the implausible frames of a motion as asked, save it, and print which frames they are.
 
     Lines go above a progress bar, if there is one.
@@ -157,20 +159,27 @@ def write_motion(output: Path, motion: Motion, rig: Rig, recording: Path, option
         rig: body and joint names.
         recording: file that the motion is from; names the motion.
         options: of the program.
+        animation: of that file, where it may have several; names the motion in its place.
 
     Returns:
         The number of frames that are saved.
 
     Raises:
-        ValueError: as `mend`; for a figure that is too far from the ground.
+        ValueError: naming the recording, as `mend`; for a figure that is too far from the ground.
     """
+    part = f", animation {animation}" if animation else ""
     height = float(np.median(np.abs(motion.translation[:, 1])))
     if height > TOO_HIGH:
-        raise ValueError(f"{recording}: the hips would be {height:.0f} m above the ground: give --up, or cut jumps out")
-    motion, report = mend(motion, rig.body, options.bad)
-    name = recording.name.partition(".")[0]
-    save_motion(output, motion, rig.names, name=name, source=recording.name, licence=options.licence)
+        raise ValueError(
+            f"{recording}{part}: the hips would be {height:.0f} m above the ground: give --up, or cut jumps out"
+        )
+    try:
+        motion, report = mend(motion, rig.body, options.bad)
+    except ValueError as error:
+        raise ValueError(f"{recording}{part}: {error}") from error
+    name, source = animation or recording.name.partition(".")[0], f"{recording.name}{part}"
+    save_motion(output, motion, rig.names, name=name, source=source, licence=options.licence)
     for doubt in doubts(motion, rig.body, rig.names):
-        tqdm.write(f"{recording}: {doubt}")
+        tqdm.write(f"{recording}{part}: {doubt}")
     tqdm.write(f"{output}: {len(motion.translation)} frames, {report}")
     return len(motion.translation)

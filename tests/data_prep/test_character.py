@@ -4,6 +4,7 @@ import copy
 import json
 import re
 
+import h5py
 import igl
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_a_character_is_the_body_and_the_motion_that_it_was_made_of(name, rig, w
     np.testing.assert_array_equal(body.faces, rig.body.faces)
     np.testing.assert_allclose(body.joints[order], rig.body.joints, atol=2e-5)
     np.testing.assert_allclose(body.weights[:, order], rig.body.weights, atol=2e-3)
-    clips, _ = gltf.motions(found, walk.fps)
+    clips, *_ = gltf.motions(found, walk.fps)
     places, expected = joint_positions(clips["a_walk"], body)[:, order], joint_positions(walk, rig.body)
     np.testing.assert_allclose(places - places[:1, :1], expected - expected[:1, :1], atol=1e-4)
     assert set(found.rig.names) == set(renamed(name, names, rig))
@@ -404,8 +405,31 @@ def test_keys_and_files_that_are_wrong_are_named(wrong, told, rig, walk, tmp_pat
     with pytest.raises(ValueError, match=rf"c\.glb: {told}"):
         gltf_motion.read_gltf(path, 30.0)
     if wrong == "zero":
-        with pytest.raises(ValueError, match=rf"c\.glb, animation a_walk: {told}"):
-            gltf.motions(character.read(path), 30.0)
+        _, _, (error,) = gltf.motions(character.read(path), 30.0)
+        assert re.search(rf"c\.glb, animation a_walk: {told}", error)
+
+
+def test_animations_that_are_refused_leave_the_others(rig, walk, tmp_path):
+    """A whole one comes after one that is damaged, and one that no body can make."""
+    wild = np.tile(np.array([[0.0, 0, 0, 1], [1.0, 0, 0, 0]]), (20, 1))
+
+    def change(document, add, read):
+        whole = document["animations"].pop()
+        for name, row in (("damaged", np.zeros((40, 4))), ("wild", wild)):
+            document["animations"].append(json.loads(json.dumps(whole)) | {"name": name})
+            document["animations"][-1]["samplers"][0]["output"] = add(row)
+        document["animations"].append(whole)
+
+    path = changed(written(tmp_path, rig.body, rig.names, walk), change)
+    arguments = gltf.Arguments(path, tmp_path / "body.h5", motions=tmp_path / "motions", bad="repair")
+    with pytest.raises(ValueError, match="2 of the animations are not written: ") as refused:
+        gltf.main(arguments)
+    damaged, wild = re.findall(rf"{re.escape(str(path))}, animation (\w+: [^;]*)", str(refused.value))
+    assert re.match("damaged: the rotation of .*Hips is no rotation", damaged)
+    assert re.match("wild: .* frames are implausible", wild)
+    assert [file.name for file in (tmp_path / "motions").iterdir()] == ["a_walk.h5"]
+    with h5py.File(tmp_path / "motions" / "a_walk.h5") as file:
+        assert (file.attrs["name"], file.attrs["source"]) == (b"a_walk", b"c.glb, animation a_walk")
 
 
 def test_objects_that_were_bound_in_other_poses_are_put_together(rig, walk, tmp_path):
