@@ -1,6 +1,7 @@
 """A recorded motion of a skeleton; resampling it; and the lines and numbers of text files that hold one."""
 
 import codecs
+import zlib
 from collections.abc import Iterator
 from gzip import open as open_gzip
 from pathlib import Path
@@ -76,7 +77,7 @@ def read_lines(path: str | Path) -> Iterator[tuple[int, list[str]]]:
                 words = line.split()
                 if words:
                     yield number, words
-    except (OSError, EOFError) as error:  # EOFError: a .gz cut short
+    except (OSError, EOFError, zlib.error) as error:  # the last two: a .gz cut short, a damaged one
         raise ValueError(f"{path}: cannot be read ({error})") from error
 
 

@@ -502,6 +502,11 @@ def test_what_is_no_recording_is_refused_with_what_to_do(rig, tmp_path):
     packed = tmp_path / "packed.bvh"
     packed.write_bytes(gzip.compress(path.read_bytes()))
     assert bvh.read_bvh(packed).names == capture.names
+    data = gzip.compress(path.read_bytes())
+    for damaged in (data[:500], data[:200] + bytes(100) + data[300:]):
+        packed.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"packed\.bvh: cannot be read"):
+            bvh.read_bvh(packed)
     for begin, told in ((b"glTF", "a glTF file"), (b"Kaydara FBX Binary", "an FBX file")):
         (tmp_path / "other.bvh").write_bytes(begin + bytes(100))
         with pytest.raises(ValueError, match=rf"other\.bvh: {told}"):
