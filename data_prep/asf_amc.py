@@ -93,10 +93,11 @@ def read_asf(path: str | Path) -> Skeleton:
             else:
                 entry[key] = (line, words[1:])
         elif section == ":hierarchy" and key not in ("begin", "end"):
+            parent = "root" if key == "root" else words[0]
             for child in words[1:]:
-                if child not in bones or (key != "root" and key not in parents):
-                    raise ValueError(f"{path}, line {line}: {words[0]} or {child} is not a bone defined before")
-                parents[child] = words[0]
+                if child not in bones or (parent != "root" and parent not in parents):
+                    raise ValueError(f"{path}, line {line}: {parent} or {child} is not a bone defined before")
+                parents[child] = parent
     if not bones or set(parents) != set(bones):
         orphans = f"bones without parent: {sorted(set(bones) - set(parents))}" if bones else "no bones: no ASF file"
         raise ValueError(f"{path}, line {line}: no complete :hierarchy ({orphans}); cut short, or AMC before ASF?")
@@ -128,15 +129,16 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
             raise ValueError(f"{path}, line {line}: {words[0]}, but its skeleton is in {unit}: correct one of them")
         if words[0][0] in "#:":
             continue
-        if len(words) == 1 and words[0].isdigit():
+        name = "root" if words[0].lower() == "root" else words[0]
+        if len(words) == 1 and name.isdigit():
             _check_frame(path, line, values, frames)
             frames += 1
-        elif words[0] not in width:
-            raise ValueError(f"{path}, line {line}: no moving bone {words[0]!r} in the skeleton")
-        elif len(values[words[0]]) != frames - 1:
-            raise ValueError(f"{path}, line {line}: {words[0]} outside of a frame, or twice in one")
+        elif name not in width:
+            raise ValueError(f"{path}, line {line}: no moving bone {name!r} in the skeleton")
+        elif len(values[name]) != frames - 1:
+            raise ValueError(f"{path}, line {line}: {name} outside of a frame, or twice in one")
         else:
-            values[words[0]].append(numbers(path, line, words[1:], width[words[0]]))
+            values[name].append(numbers(path, line, words[1:], width[name]))
     _check_frame(path, line, values, frames)
     if not frames:
         raise ValueError(f"{path}, line {line}: no frames")
@@ -156,7 +158,7 @@ def read_amc(path: str | Path, skeleton: Skeleton, fps: float = 120.0) -> Captur
             own = Rotation.from_euler(bone.freedoms, np.array(values[name]), degrees=skeleton.degrees)
             rotations[:, j] = (bone.frame * own * bone.frame.inv()).as_matrix()
     parents = np.array([-1] + [names.index(skeleton.parents[name]) for name in names[1:]])
-    return Capture(tuple(CMU_NAMES.get(n, n) for n in names), parents, offsets, rotations, channels, fps)
+    return Capture(tuple(CMU_NAMES.get(n.lower(), n) for n in names), parents, offsets, rotations, channels, fps)
 
 
 def _bone(path: str | Path, line: int, entry: dict, degrees: bool) -> tuple[str, Bone]:

@@ -151,6 +151,18 @@ def test_asf_and_amc(tmp_path):
     np.testing.assert_allclose(capture.rotations[1, 3], np.eye(3))
 
 
+def test_capitals_in_asf_and_amc(tmp_path):
+    usual, capitals = (
+        asf_amc.read_amc(
+            _write(tmp_path / "a.amc", change(AMC)), asf_amc.read_asf(_write(tmp_path / "a.asf", change(ASF)))
+        )
+        for change in (str, str.title)
+    )
+    assert capitals.names == CHAIN and "Root Lfemur" in ASF.title()
+    for expected, found in zip(usual[1:], capitals[1:]):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_bvh_agrees_with_asf_and_amc(tmp_path):
     skeleton = asf_amc.read_asf(_write(tmp_path / "a.asf", ASF))
     wanted = asf_amc.read_amc(_write(tmp_path / "a.amc", AMC), skeleton)
