@@ -6,7 +6,8 @@ Plain or .gz. Which joint is which is known of many programs (`skeleton.py`), or
 frames say which way is up, and how a joint is turned in a T-pose.
 """
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -142,7 +143,7 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
     names, parents, offsets, channels = [], [], [], []
     open_joints: list[int] = []  # -1 for an end site
     next_open, line = None, 0  # joint whose brace comes next
-    for line, words in lines:
+    for line, words in _statements(lines):
         key = words[0]
         if key == "MOTION":
             if open_joints or not names or any(o is None for o in offsets):
@@ -152,13 +153,13 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
             if len(words) < 2 or (key == "ROOT") == bool(names) or (key == "JOINT" and not open_joints):
                 raise ValueError(f"{path}, line {line}: {' '.join(words)!r}: one ROOT, then JOINTs within it")
             next_open = len(names)
-            names.append(" ".join(words[1:]).removesuffix("{").strip())
+            names.append(" ".join(words[1:]))
             parents.append(open_joints[-1] if open_joints else -1)
             offsets.append(None)
             channels.append([])
         elif key == "End":
             next_open = -1
-        if words[-1] == "{":
+        elif key == "{":
             if next_open is None:
                 raise ValueError(f"{path}, line {line}: '{{' without a joint")
             open_joints.append(next_open)
@@ -171,9 +172,17 @@ def _hierarchy(path: str | Path, lines) -> tuple[list[str], list[int], np.ndarra
                 offsets[joint] = numbers(path, line, words[1:], 3)
             elif key == "CHANNELS":
                 channels[joint] = _channels(path, line, words)
-        elif key not in ("HIERARCHY", "ROOT", "JOINT", "End"):
+        elif key != "HIERARCHY":
             raise ValueError(f"{path}, line {line}: {' '.join(words)[:60]!r} is not part of a BVH hierarchy")
     raise ValueError(f"{path}, line {line}: no MOTION; cut short, or not a BVH file")
+
+
+def _statements(lines: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and words of each statement in the lines of a hierarchy; a brace is one, wherever it is."""
+    for line, words in lines:
+        for statement in re.split("([{}])", " ".join(words)):
+            if statement.strip():
+                yield line, statement.split()
 
 
 def _channels(path: str | Path, line: int, words: list[str]) -> list[str]:

@@ -215,6 +215,15 @@ def test_malformed_amc_names_its_line(tmp_path, old, new, words):
         assert word in str(error.value)
 
 
+def test_braces_of_bvh_may_be_beside_other_words(tmp_path):
+    wanted = bvh.read_bvh(_write(tmp_path / "a.bvh", BVH))
+    for text in (re.sub(r"\n *\{\n *", "{", BVH), re.sub(r"\n *\}", " }", BVH), re.sub(r"\n *([{}])", r"\1", BVH)):
+        found = bvh.read_bvh(_write(tmp_path / "b.bvh", text))
+        assert found.names == wanted.names
+        for one, other in zip(found[1:], wanted[1:]):
+            np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize(
     "old, new, words",
     [
