@@ -63,7 +63,8 @@ def read_bvh(path: str | Path, tell: Callable[[str], object] = str, joints: Path
     for line, words in lines:
         rows.append(numbers(path, line, words, width))
     if len(rows) != frames:
-        raise ValueError(f"{path}, line {line}: {len(rows)} frames, {frames} announced; cut short?")
+        why = "cut short?" if len(rows) < frames else f"write 'Frames: {len(rows)}', or take out what is too much"
+        raise ValueError(f"{path}, line {line}: {len(rows)} frames, {frames} announced; {why}")
 
     values, column = np.array(rows), 0
     rotations = np.tile(np.eye(3), (frames, len(names), 1, 1))

@@ -229,7 +229,8 @@ def test_braces_of_bvh_may_be_beside_other_words(tmp_path):
     [
         ("OFFSET 0 -2 0", "OFFSET 0 -2", ["line 12", "expected 3"]),
         ("CHANNELS 6 Xposition", "CHANNELS 6 Wposition", ["line 5", "Wposition"]),
-        ("Frames: 2", "Frames: 3", ["3 announced"]),
+        ("Frames: 2", "Frames: 3", ["3 announced; cut short?"]),
+        ("Frames: 2", "Frames: 1", ["1 announced; write 'Frames: 2', or take out"]),
         ("Frame Time: 0.0083333", "Frame Time: 0", ["line 28", "> 0"]),
         ("30 20 10", "30 20", ["line 30", "expected 15"]),
         ("  }\n}\nMOTION", "  }\nMOTION", ["line 25", "complete"]),
