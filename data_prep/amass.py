@@ -1,4 +1,4 @@
-"""Motions of AMASS (SMPL-H and SMPL-X layouts), for any body with CMU's or SMPL's joint names.
+"""Motions of AMASS (SMPL-H and SMPL-X layouts), for any body whose joints have names of a known scheme.
 
     python -m data_prep.amass 01_01_poses.npz out.h5 --body body.h5 --fps 30
     python -m data_prep.amass --list configs/thesis/takes.yaml AMASS_FOLDER OUT_FOLDER --body body.h5
@@ -146,7 +146,7 @@ def retarget_amass(
 
     Args:
         capture: the recording, from `read_amass`.
-        body_file: file of the body (or embedded), with CMU's or SMPL's joint names.
+        body_file: file of the body (or embedded), whose joints have names that `skeleton` knows.
         fps: frames per second of the result.
         leg: m, from hip to ankle of the recorded person; the path is scaled to the body's leg.
         freeze: keep toes and wrists as in the canonical pose.
@@ -159,17 +159,18 @@ def retarget_amass(
         ValueError: for a body without the joints, or a recording of fewer than two frames.
     """
     capture, rig = resample(capture, fps), load_rig(body_file)
-    names = cmu_names(rig.names)
-    local = {
-        name: capture.rotations[:, i]
-        for i, name in enumerate(capture.names)
-        if not (freeze and any(part in name for part in FROZEN))
-    }
-    lacking = sorted(set(local) - set(names))
+    parts = skeleton.find(cmu_names(rig.names), rig.body.parents, str(body_file))
+    known = skeleton.landmarks(rig.names, rig.body.parents)
+    moved = {name: i for i, name in enumerate(capture.names) if not (freeze and any(part in name for part in FROZEN))}
+    lacking = sorted(set(moved) - set(known))
     if lacking:
-        raise ValueError(f"{body_file} has no joint {', '.join(lacking)}: name its joints as CMU's or SMPL's")
-    rotations = from_t_pose(local, rig.body, names, canonical_rotation(body_file))
-    scale = leg_length(rig.body.joints, skeleton.find(names, rig.body.parents, str(body_file))) / leg
+        raise ValueError(f"{body_file} has no joint that is known as {', '.join(lacking)}: rename its joints")
+    local: dict[str, np.ndarray] = {}
+    for joint, i in moved.items():  # two of a short trunk may be one
+        name, turn = rig.names[known[joint]], capture.rotations[:, i]
+        local[name] = local[name] @ turn if name in local else turn
+    rotations = from_t_pose(local, rig.body, rig.names, canonical_rotation(body_file))
+    scale = leg_length(rig.body.joints, parts) / leg
     path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale
     motion = stand(Motion(rotations.astype(np.float32), path, fps), rig.body)
     for line in doubts.ground(float(path[0, 1] - motion.translation[0, 1])):

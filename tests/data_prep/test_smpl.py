@@ -8,6 +8,7 @@ import types
 
 import numpy as np
 import pytest
+import recorded
 import scipy.sparse
 import trimesh
 from samples import PARENTS, recording, smpl_regressor
@@ -259,6 +260,20 @@ def test_a_recording_moves_the_embedded_body_possibly(tmp_path):
     poses = [Pose(*frame) for frame in zip(motion.rotations, np.float32(motion.translation))]
     lowest = [float(skinning.pose_body(body, body.vertices, body.joints, pose)[:, 1].min()) for pose in poses[::5]]
     assert -0.03 < min(lowest) < 0.03
+
+
+@pytest.mark.parametrize("scheme", ["Mixamo", "Unreal", "VRM", "SMPL"])
+def test_a_recording_moves_a_body_of_other_names_alike(scheme, tmp_path):
+    rig = storage.load_rig("body")
+    other = [recorded.SCHEMES[scheme].get(name, name) for name in rig.names]
+    about = {"name": "b", "source": "test", "licence": "CC0-1.0"}
+    turn = storage.canonical_rotation("body")
+    storage.save_body(tmp_path / "body.h5", rig.body, other, **about, canonical_rotation=turn)
+    np.savez(tmp_path / "clip.npz", **recording())
+    capture = amass.read_amass(tmp_path / "clip.npz")
+    (expected, _), (found, _) = (amass.retarget_amass(capture, each) for each in ("body", tmp_path / "body.h5"))
+    np.testing.assert_allclose(found.rotations, expected.rotations, atol=1e-5)
+    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-5)
 
 
 def test_a_recording_that_is_up_in_y_can_be_told(tmp_path):
