@@ -171,7 +171,7 @@ def retarget_amass(
         local[name] = local[name] @ turn if name in local else turn
     rotations = from_t_pose(local, rig.body, rig.names, canonical_rotation(body_file))
     scale = leg_length(rig.body.joints, parts) / leg
-    path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale
+    path = (capture.translation - capture.translation[0] * [1, 0, 1]) * scale - rig.body.joints[0]
     motion = stand(Motion(rotations.astype(np.float32), path, fps), rig.body)
     for line in doubts.ground(float(path[0, 1] - motion.translation[0, 1])):
         tell(line)

@@ -276,6 +276,21 @@ def test_a_recording_moves_a_body_of_other_names_alike(scheme, tmp_path):
     np.testing.assert_allclose(found.translation, expected.translation, atol=1e-5)
 
 
+def test_a_body_that_stands_on_its_origin_is_moved_as_one_that_hangs_on_it(tmp_path):
+    body, names = storage.load_rig("body")
+    up = np.float32([0.1, 0.9, 0.2])
+    body = body._replace(vertices=body.vertices + up, joints=body.joints + up)
+    about = {"name": "b", "source": "test", "licence": "CC0-1.0"}
+    turn = storage.canonical_rotation("body")
+    storage.save_body(tmp_path / "body.h5", body, names, **about, canonical_rotation=turn)
+    np.savez(tmp_path / "clip.npz", **recording())
+    capture, doubts = amass.read_amass(tmp_path / "clip.npz"), []
+    motion, _ = amass.retarget_amass(capture, tmp_path / "body.h5", tell=doubts.append)
+    hanging, _ = amass.retarget_amass(capture, "body")
+    np.testing.assert_allclose(motion.translation + up, hanging.translation, atol=1e-5)
+    assert doubts == []
+
+
 def test_a_recording_that_is_up_in_y_can_be_told(tmp_path):
     data = recording(joints=55)
     data["mocap_frame_rate"] = data.pop("mocap_framerate")  # as of SMPL-X
