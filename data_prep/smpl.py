@@ -117,7 +117,7 @@ def read(path: str | Path) -> dict[str, np.ndarray]:
     """
     path = Path(path)
     try:
-        if path.suffix == ".npz":
+        if path.suffix.lower() == ".npz":
             with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 arrays = {key: file[key] for key in (*KEYS, "posedirs") if key in file.files}
         else:

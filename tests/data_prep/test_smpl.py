@@ -3,6 +3,7 @@
 import collections
 import gzip
 import pickle
+import shutil
 import sys
 import types
 
@@ -118,6 +119,8 @@ def test_an_npz_is_read_like_a_pickle(model, tmp_path):
     np.savez(tmp_path / "SMPL_NEUTRAL.npz", **plain)
     body, _ = smpl.body(tmp_path / "SMPL_NEUTRAL.npz")
     assert_is(body, model)
+    shutil.copy(tmp_path / "SMPL_NEUTRAL.npz", tmp_path / "CAPITALS.NPZ")
+    assert_is(smpl.body(tmp_path / "CAPITALS.NPZ")[0], model)
     assert smpl.body(tmp_path / "SMPL_NEUTRAL.npz", shapes=12)[0].shapedirs.shape[-1] == 12
     with pytest.raises(ValueError, match=r"has 12 shape parameters; --shapes 13"):
         smpl.body(tmp_path / "SMPL_NEUTRAL.npz", shapes=13)
