@@ -38,7 +38,7 @@ class Arguments:
     vertices: int | None = None
     """Approximate number of vertices; default: 1000 for a template, the mesh's own for a mesh."""
     mesh: Path | None = None
-    """A mesh (.obj, .ply, .off, .stl, .glb) around the body in its canonical pose."""
+    """A mesh (.obj, .ply, .off, .stl, .glb, .gltf) around the body in its canonical pose."""
     units: Unit = "m"
     """Unit of length of the mesh."""
     up: Axis = "y"

@@ -23,7 +23,7 @@ class Mesh(NamedTuple):
 
 
 def read(path: str | Path) -> Mesh:
-    """Read a mesh file (.obj, .ply, .off, .stl, .glb), with all of its objects in one mesh.
+    """Read a mesh file (.obj, .ply, .off, .stl, .glb, .gltf), with all of its objects in one mesh.
 
     Raises:
         ValueError: if it is no mesh, has no triangles, or has a vertex that is not finite.

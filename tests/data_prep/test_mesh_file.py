@@ -1,17 +1,26 @@
 """Files of meshes as programs write them: what is moved, grouped, quantised or skinned comes out where it is shown."""
 
 import base64
+import inspect
 import json
+import re
 
 import numpy as np
 import pytest
+import samples
 
-from data_prep import gltf_file, mesh_file, polygon_file
+from data_prep import garment, gltf_file, mesh_file, polygon_file
 from data_prep.gltf_file import DTYPES
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 PLACE = np.array([[0.0, -2, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])  # twice as large, a quarter turned
+
+
+def test_the_endings_are_the_same_wherever_they_are_told():
+    table = (samples.ROOT / "data_prep" / "README.md").read_text()
+    (told,) = re.findall(r"\| `garment` \| a mesh (\(.*?\))", table)
+    assert told in inspect.getsource(garment) and told in mesh_file.read.__doc__
 
 
 class File:
