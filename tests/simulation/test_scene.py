@@ -34,6 +34,14 @@ def experiment():
     return assembly.assemble(dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, pool=1)))
 
 
+def test_a_garment_of_another_skeleton_is_no_experiment(tmp_path):
+    garment, (_, names) = storage.load_garment("skirt_1000", storage.load_body("body")), storage.load_rig("body")
+    about = {"name": "g", "body": "other", "source": "test", "licence": "CC0-1.0"}
+    storage.save_garment(tmp_path / "g.h5", garment, names[::-1], **about)
+    with pytest.raises(ValueError, match=r"g\.h5: joints differ from the body's: the garment has another order"):
+        assembly.assemble(dataclasses.replace(small(), garment=str(tmp_path / "g.h5")))
+
+
 @pytest.fixture(scope="module")
 def flops(experiment):
     """Of a frame of a training rollout in every scene, with its losses."""
