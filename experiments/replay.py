@@ -60,7 +60,7 @@ def replay(run: Path, stage: str, steps: int, allowed: int) -> str:
     if source.step >= total:
         raise ValueError(f"{start}: {stage} has taken all of its {total} steps: it did not diverge")
     experiment = assembly.assemble(config)
-    clips, _ = assembly.training_clips(experiment)
+    clips, _ = assembly.training_clips(experiment, getattr(config, stage))
     update, starting, state = _again(run, stage, experiment, clips)
     state, _ = checkpoint.restore(start, state)
     print(f"from step {source.step} of {start}", flush=True)

@@ -39,7 +39,7 @@ def main(argv: list[str]) -> None:
     _, phi = trained.phi(folder)
     source = trained.psi(folder)
     experiment = assembly.assemble(config)
-    clips, _ = assembly.training_clips(experiment)
+    clips, _ = assembly.training_clips(experiment, config.tuning)
     normalizers = source.normalizers
     if isinstance(normalizers, Normalizers):  # a Psi with forces does not read the pose
         input_joints = psi.input_joints(experiment.names, config.stage2)

@@ -9,7 +9,7 @@ import numpy as np
 
 from clothjax.body import motion_clips, plausibility, skinning
 from clothjax.body.motion_clips import Clips
-from clothjax.config import Config
+from clothjax.config import Config, PhysicsTrainingConfig
 from clothjax.files import storage
 from clothjax.simulation import characters, scene
 from clothjax.simulation.characters import Character
@@ -79,8 +79,11 @@ def training_motions(config: Config) -> tuple[str, ...]:
     return tuple(name for name in storage.asset_names("motion") if name not in evaluated)
 
 
-def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
+def training_clips(experiment: Experiment, stage: PhysicsTrainingConfig | None = None) -> tuple[Clips, dict[str, int]]:
     """Load the training clips; return them, and by name how many impossibly fast frames were left out.
+
+    Args:
+        stage: whose rollouts begin where enough frames follow; default: stage 1.
 
     Raises:
         ValueError: as `motion`, and if no clip is long enough for a rollout.
@@ -90,8 +93,8 @@ def training_clips(experiment: Experiment) -> tuple[Clips, dict[str, int]]:
     bad = [plausibility.bad_frames(clip, experiment.body) for clip in motions]
     # a family is a kind of motion, as in walk_0 or cmu_01_02; families are drawn equally often
     families = [Path(name).stem.split(".")[0].rsplit("_", 1)[0] for name in names]
-    stages = [experiment.config.stage1] + [experiment.config.tuning] * (experiment.config.tuning.steps > 0)
-    shortest = max(max(stage.rollout, stage.rollout_end) for stage in stages) + 1
+    stage = stage or experiment.config.stage1
+    shortest = max(stage.rollout, stage.rollout_end) + 1
     try:
         clips = motion_clips.concatenate(motions, families, bad, shortest)
     except ValueError as error:

@@ -4,6 +4,7 @@ A stage with a checkpoint at its last step is read, not trained again. A stage w
 it. Any other stage starts anew. The first checkpoint of stage 1 contains the blend shapes and the preconditioner.
 """
 
+import dataclasses
 import shutil
 import time
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from jax.sharding import Mesh
 
 from clothjax import progress
 from clothjax.body.motion_clips import Clips
-from clothjax.config import Config
+from clothjax.config import Config, EvaluationConfig
 from clothjax.files import checkpoint, configuration
 from clothjax.material import configured_material
 from clothjax.networks import animators, forces
@@ -44,7 +45,7 @@ from clothjax.training import (
 
 STEPS_PER_CALL = 20
 PHYSICS = ("stage1", "tuning")  # stages in which the physics is the loss
-# settings that a stage does not read, so a run may change them and go on
+# settings that a stage does not read, so a run may change them and go on; but see `_refuse_other_motions`
 MAY_DIFFER = {
     "stage1": ("directory", "evaluation", "stage2", "labels", "tuning"),
     "stage2": ("directory", "evaluation", "tuning"),
@@ -58,7 +59,7 @@ class Run(NamedTuple):
 
     experiment: Experiment
     directory: Path
-    clips: Clips
+    clips: Clips  # those of fine-tuning may begin at other frames
     device_mesh: Mesh | None
 
     @property
@@ -107,7 +108,8 @@ def train(config: Config, directory: Path, device_mesh: Mesh | None = None) -> d
     }
     if config.tuning.steps > 0:
         psi = Psi(second.state.garment, second.state.average, second.state.normalizers)
-        third = fine_tune(run, first.state.average, psi)
+        tuned = run._replace(clips=assembly.training_clips(run.experiment, config.tuning)[0])
+        third = fine_tune(tuned, first.state.average, psi)
         clock["compile_seconds"] += third.compile_seconds
         clock["tuning_seconds"] = third.seconds
     return clock
@@ -127,8 +129,10 @@ def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) ->
         progress.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     experiment = assembly.assemble(config)
     clips, left_out = assembly.training_clips(experiment)
+    if config.tuning.steps > 0:
+        assembly.training_clips(experiment, config.tuning)  # what is too short shows now, not after hours
     for name in config.evaluation.motions:
-        assembly.evaluation_motion(experiment, name)  # a wrong one shows now, not after hours
+        assembly.evaluation_motion(experiment, name)  # and so does what is wrong
     for name, count in left_out.items():
         if count:
             progress.say(f"{name}: {count} frames left out, a joint moves impossibly fast around them")
@@ -151,8 +155,7 @@ def train_phi(run: Run) -> loop.Fitted:
     """Run stage 1: prepare blend shapes and preconditioner, then train Phi on the physics; return it, finished."""
     scene, config = run.experiment.scene, run.config
     began, new = time.monotonic(), not run.steps("stage1")
-    # the simulations of hours survive a process that is ended; they are not needed after the first checkpoint
-    simulated = run.directory / f"simulated_{run_folder.fingerprint(_read_by('stage1', config))}"
+    simulated = _simulated(run)
     shapes, hessians = (None, None) if jax.process_count() > 1 else (simulated / "shapes", simulated / "hessians")
     for folder in (shapes, hessians) if new else ():
         if folder is not None:
@@ -314,6 +317,7 @@ def _fit(
     run: Run, stage: str, update: Callable, state: NamedTuple, steps: int, description: str, kind: str | None = None
 ) -> loop.Fitted:
     """Train a stage in its folder of the run; `kind` is its key in `MAY_DIFFER`, by default its name."""
+    _refuse_other_motions(run, stage)
     return loop.fit(
         update,
         devices.replicate(state, run.device_mesh),
@@ -324,6 +328,30 @@ def _fit(
         description=description,
         may_differ=MAY_DIFFER[kind or stage],
     )
+
+
+def _refuse_other_motions(run: Run, stage: str) -> None:
+    """Raise a ValueError if a stage has begun on other motions: which they are may depend on those held out."""
+    if not run.steps(stage):
+        return
+    folder = run.directory / stage
+    stored = checkpoint.latest(folder / "checkpoints").config.get("evaluation", {})
+    evaluation = configuration.from_dict(EvaluationConfig, stored, str(folder), stored=True)
+    there = assembly.training_motions(dataclasses.replace(run.config, evaluation=evaluation))
+    here = assembly.training_motions(run.config)
+    if there != here:
+        raise ValueError(
+            f"{folder} was trained on other motions, as {', '.join(evaluation.motions) or 'none'} were held out there, "
+            f"{', '.join(run.config.evaluation.motions) or 'none'} here: use another directory, or set `motions`"
+        )
+
+
+def _simulated(run: Run) -> Path:
+    """Return where the simulations before stage 1 are kept: hours of work survive a process that is ended."""
+    settings = _read_by("stage1", run.config)
+    before = run.directory / f"simulated_{run_folder.fingerprint(settings)}"  # of a run that an older version began
+    settings |= {"motions": assembly.training_motions(run.config)}
+    return before if before.is_dir() else run.directory / f"simulated_{run_folder.fingerprint(settings)}"
 
 
 def _read_by(stage: str, config: Config) -> dict:
