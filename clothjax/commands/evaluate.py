@@ -23,7 +23,8 @@ and maxima stand beside them.
     swing_ratio, swing_correlation            of the velocity that skinning does not explain, relative to the solver's
                     in its own rollout: 1 is as lively. `rollout_error_mm` is the distance to that rollout,
                     `wrinkle_ratio` the ratio of rms dihedral angles.
-    edge_strain_p95, edge_strain_max          of |l / l_0 - 1|; `edge_strain_ratio`, the first over the solver's.
+    edge_strain_p95, edge_strain_max          of |l / l_0 - 1|; `edge_strain_ratio`, the first over the solver's, at the
+                    frames of its own rollout.
     jitter          rms of the second time difference of vertex accelerations, over the solver's in its own rollout.
     psi_phi_mm      mean vertex distance of Psi to Phi, over the first motion played there and back for
                     `evaluation.long_frames` frames of rollout, from frame 5 on; `_last100` its last hundred,

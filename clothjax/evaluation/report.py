@@ -264,7 +264,8 @@ def measure(
             body, every_fourth = experiment.body, range(SETTLING_FRAMES, frames, 4)
             measured |= metrics.penetrations(body, character.betas, track, poses, every_fourth, experiment.names)
         measured |= metrics.edge_strain(scene, character, track[late])
-        measured["edge_strain_ratio"] = measured["edge_strain_p95"] / strain["edge_strain_p95"]
+        then = metrics.edge_strain(scene, character, track[common])
+        measured["edge_strain_ratio"] = then["edge_strain_p95"] / strain["edge_strain_p95"]
         measured |= metrics.beside_solver(scene, track[common], solved[common], tracks.methods["lbs"][common])
         measured["jitter"] = metrics.roughness(track[common], advance) / roughness
         result[method] = measured

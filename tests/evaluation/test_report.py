@@ -72,6 +72,23 @@ def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
             assert max(which) < frames - 2 if name == "solver" else len(which.translation) == frames
 
 
+def test_strain_is_compared_at_the_frames_of_the_solver(tmp_path, monkeypatch):
+    """Where the motion is wilder after them, a method is not blamed for it."""
+    experiment = random_force_psi().experiment
+    character = assembly.dress(experiment, jnp.zeros(10), configured_material(experiment.config))
+    others = {"step_measures": [], "gaps": {}, "penetrations": {}, "beside_solver": {}, "roughness": 1.0}
+    for name, measured in others.items():
+        monkeypatch.setattr(metrics, name, lambda *_, measured=measured: measured)
+    strained = 1.1 * np.asarray(character.template)[None]
+    track = np.concatenate([np.repeat(strained, 12, axis=0), np.repeat(1.4 * strained, 20, axis=0)])
+    clip = assembly.motion(experiment, "walk_3")
+    clip = clip._replace(rotations=clip.rotations[:34], translation=clip.translation[:34])
+    tracks = rollouts.Tracks({"lbs": track}, track[:12])
+    measured = report.measure(experiment, character, clip, tracks, 1.0, None)["lbs"]
+    assert measured["edge_strain_ratio"] == pytest.approx(1.0)
+    assert measured["edge_strain_p95"] == pytest.approx(0.54, rel=1e-4)
+
+
 def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):
     experiment = random_force_psi().experiment
     measured = report.Measured(tmp_path, experiment, None, {}, None, 0)
