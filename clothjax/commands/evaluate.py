@@ -33,7 +33,9 @@ and maxima stand beside them.
     ms_per_frame    of the jitted rollout, on this machine.
 
 Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penetration at every fourth frame. With
-`evaluation.wearers` the gaps of nine other characters on the first motion stand under `wearers`.
+`evaluation.wearers` the gaps of nine other characters on the first motion stand under `wearers`. Those of Psi with
+forces, pushed by accelerations of `PUSHES`, stand under `pushed`. Both are of at most 90 frames; a push that a shorter
+motion does not reach is left out.
 
 The report of one folder is written into it, as `evaluation.json`. For names, or several folders, it has the means over
 garments under `mean` and the report of each under its name. Validation motions that are not present are then left out:

@@ -112,7 +112,8 @@ def _evaluated(
     for name in names:
         assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
     wearers = assembly.wearers(measured.experiment) if config.evaluation.wearers else ()
-    pushes = PUSHES if config.stage2.forces else ()
+    frames = len(_start(measured.experiment, names[0]).translation) - 2
+    pushes = [push for push in PUSHES if config.stage2.forces and _pushed_steps(push, frames)]
     in_motion = {name: Part(measure_motion, (name,)) for name in names}
     over_long = Part(measure_long, (names[0],))
     worn = {wearer: Part(measure_wearer, (names[0], wearer)) for wearer in wearers}
@@ -275,8 +276,7 @@ def measure(
 def measure_wearer(measured: Measured, name: str, wearer: str) -> dict[str, dict]:
     """Measure the gaps of all methods but skinning on one of nine characters, over the start of a motion."""
     experiment, methods = measured.experiment, measured.methods
-    config, clip = experiment.config, assembly.motion(experiment, name)
-    clip = Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
+    config, clip = experiment.config, _start(experiment, name)
     poses = windows(clip)
     sampled = np.linspace(SETTLING_FRAMES, len(clip.translation) - 4, CHARACTERS_GAPS).astype(int)
     character = assembly.dress(experiment, *assembly.wearers(experiment)[wearer])
@@ -292,20 +292,31 @@ def measure_wearer(measured: Measured, name: str, wearer: str) -> dict[str, dict
 def measure_push(measured: Measured, name: str, push: str) -> dict[str, float]:
     """Measure the gaps of a Psi with forces under an acceleration beside gravity, over the start of a motion."""
     run, experiment, character, *_ = measured
-    config, frames, clip = experiment.config, CHARACTERS_FRAMES, assembly.motion(experiment, name)
-    clip = Motion(clip.rotations[:frames], clip.translation[:frames], clip.fps)
+    config, clip = experiment.config, _start(experiment, name)
     poses, (acceleration, lasting) = windows(clip), PUSHES[push]
     count = poses.translation.shape[0]
     psi = loading.load(run, betas=np.asarray(character.betas), material=character.material)
     external = np.zeros((count, 3), np.float32)
     external[slice(*lasting)] = acceleration
-    first, last = max(lasting[0] - 1, SETTLING_FRAMES), (lasting[1] or count) - 2  # steps that are pushed
-    sampled = np.linspace(first, last, 2 * CHARACTERS_GAPS).astype(int)
+    pushed = _pushed_steps(push, count)
+    sampled = np.unique(np.linspace(pushed[0], pushed[-1], 2 * CHARACTERS_GAPS).astype(int))
     track = psi_trajectory(psi, clip, jnp.asarray(external))
     steps = metrics.step_measures(
         experiment.scene, character, jnp.asarray(track), poses, sampled, config, external=external
     )
     return metrics.gaps(steps)
+
+
+def _start(experiment: Experiment, name: str) -> Motion:
+    """Return the start of a motion, on which characters and pushes are measured."""
+    clip = assembly.evaluation_motion(experiment, name)
+    return Motion(clip.rotations[:CHARACTERS_FRAMES], clip.translation[:CHARACTERS_FRAMES], clip.fps)
+
+
+def _pushed_steps(push: str, frames: int) -> range:
+    """Return the steps of a rollout of `frames` frames in which it is pushed; none if it ends before."""
+    begin, end = PUSHES[push][1]
+    return range(max(begin - 1, SETTLING_FRAMES), min(end or frames, frames) - 1)
 
 
 def measure_long(measured: Measured, name: str) -> dict[str, dict]:

@@ -41,6 +41,29 @@ def test_what_pushes_is_sampled_while_it_pushes(tmp_path, monkeypatch):
     assert np.abs(gust[30] - calm[30]).max() > 1e-5
 
 
+@pytest.mark.parametrize(("frames", "pushed"), [(12, ["none", "no gravity", "sideways"]), (36, list(report.PUSHES))])
+def test_what_pushes_is_not_sampled_beyond_a_short_motion(tmp_path, monkeypatch, frames, pushed):
+    forced = random_force_psi()
+    config = forced.experiment.config
+    settings = dataclasses.replace(config.evaluation, frames=frames)
+    experiment = forced.experiment._replace(config=dataclasses.replace(config, evaluation=settings))
+    character = assembly.dress(experiment, jnp.zeros(10), configured_material(config))
+    measured = report.Measured(tmp_path, experiment, character, {}, None, 0)
+    monkeypatch.setattr(report.Measured, "load", lambda *_: measured)
+    monkeypatch.setattr(loading, "load", lambda run, **character: None)
+    monkeypatch.setattr(report, "psi_trajectory", lambda psi, clip, external: np.zeros((len(external), 3, 3)))
+    asked = []
+    monkeypatch.setattr(metrics, "step_measures", lambda *given, external: asked.extend(external[given[4] + 1]))
+    monkeypatch.setattr(metrics, "gaps", lambda steps: {"hold_gap": 1.0})
+    for name in ("measure_motion", "measure_long"):
+        monkeypatch.setattr(report, name, lambda *_: {})
+    monkeypatch.setattr(
+        report, "measure_all", lambda parts, measured, *_: {p: p.measure(measured, *p.about) for p in parts}
+    )
+    assert list(report.evaluate(tmp_path, ["walk_3"])["pushed"]) == pushed
+    assert len(asked) >= 4 * len(pushed)
+
+
 def test_each_wearer_is_measured_as_it_is(tmp_path, monkeypatch):
     """A method and the solver are asked of one character in its own cloth; skinning is asked nothing."""
     experiment = random_force_psi().experiment
