@@ -44,6 +44,7 @@ from clothjax.training import (
 )
 
 STEPS_PER_CALL = 20
+MAY_BE_NONE = ("tuning.steps", "labels.last_steps")  # steps that a run need not take
 PHYSICS = ("stage1", "tuning")  # stages in which the physics is the loss
 # settings that a stage does not read, so a run may change them and go on; but see `_refuse_other_motions`
 MAY_DIFFER = {
@@ -125,6 +126,8 @@ def prepare(config: Config, directory: Path, device_mesh: Mesh | None = None) ->
     for name, steps in _all_steps(config).items():
         if steps < 0 or steps % STEPS_PER_CALL:
             raise ValueError(f"{name} must be a multiple of {STEPS_PER_CALL}, got {steps}")
+        if steps == 0 and name not in MAY_BE_NONE:
+            raise ValueError(f"{name} must be more than 0: what follows needs what it trains")
     if device_mesh is not None:
         progress.say(f"{device_mesh.size} devices, {jax.process_count()} processes; {jax.devices()[0].device_kind}")
     experiment = assembly.assemble(config)

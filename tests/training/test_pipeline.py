@@ -41,6 +41,15 @@ def test_a_stage_goes_on_only_with_the_motions_that_it_was_trained_on(tmp_path, 
     go_on(dataclasses.replace(other, motions=("walk_0",)))  # the other settings tell such runs apart
 
 
+@pytest.mark.parametrize(("part", "forces"), [("stage1", False), ("stage2", False), ("labels", True)])
+def test_a_stage_that_others_need_takes_a_step(tmp_path, part, forces):
+    config = small()
+    config = dataclasses.replace(config, stage2=dataclasses.replace(config.stage2, forces=forces))
+    config = dataclasses.replace(config, **{part: dataclasses.replace(getattr(config, part), steps=0)})
+    with pytest.raises(ValueError, match=rf"{part}\.steps must be more than 0"):
+        pipeline.prepare(config, tmp_path)
+
+
 def test_what_is_simulated_before_stage_1_is_of_the_motions(tmp_path):
     config = held_out(small(), "walk_3")
     kept = pipeline._simulated(run(config, tmp_path))
