@@ -22,7 +22,7 @@ from clothjax.evaluation.rollouts import (
     skinned_trajectory,
     windows,
 )
-from clothjax.files import configuration, storage
+from clothjax.files import configuration
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
@@ -64,9 +64,9 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, 
         present = motions
         if present is None:
             wanted = trained.configured(folder).evaluation.motions
-            present = [motion for motion in wanted if storage.asset(motion).is_file()]
+            present = assembly.present(wanted)
             absent = set(wanted) - set(present)
-            print(f"{name}: on {', '.join(present)}", *(f"({motion} is not here)" for motion in absent))
+            print(f"{name}: on {', '.join(present) or 'no motion'}", *(f"({motion} is not here)" for motion in absent))
         reports[name] = _evaluated(folder, present, jobs=jobs)
     for folder in folders.values():  # not before all of them are measured
         _forget(folder)
@@ -104,7 +104,7 @@ def _evaluated(
     measured = Measured.load(run, settings)
     output_folder(run).mkdir(parents=True, exist_ok=True)
     config = measured.experiment.config
-    names = list(motions or config.evaluation.motions)
+    names = list(config.evaluation.motions if motions is None else motions)
     if not names:
         raise ValueError(f"{run}: none of its validation motions is here; name others with --motions")
     if len({Path(name).stem for name in names}) < len(names):

@@ -1,5 +1,6 @@
 """From a configuration to loaded data: body and garment, the scene, motion clips, characters."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -119,6 +120,11 @@ def evaluation_motion(experiment: Experiment, name: str | Path) -> Motion:
             f"{MEASURABLE} are needed"
         )
     return clip
+
+
+def present(motions: Sequence[str]) -> list[str]:
+    """Return those of the motions, such as `evaluation.motions`, that are here: motion capture may not be."""
+    return [name for name in motions if storage.asset(name).is_file()]
 
 
 def windows(clip: Motion) -> Clips:

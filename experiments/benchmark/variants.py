@@ -16,7 +16,6 @@ from clothjax.evaluation import rollouts
 from clothjax.evaluation.rollouts import load_run, relative, skinned_trajectory, windows
 from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
-from clothjax.files import storage
 from clothjax.networks import psi
 from clothjax.networks.animators import phi_animator
 from clothjax.networks.baselines import inputs as baseline_inputs
@@ -72,7 +71,7 @@ def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
                 "has to be trained for the same"
             )
     shared = [name for name in first.evaluation.motions if all(name in c.evaluation.motions for c in configs)]
-    names = motions or [name for name in shared if storage.asset(name).is_file()]
+    names = motions or assembly.present(shared)
     if not names:
         raise ValueError(f"{', '.join(map(str, runs))}: no motion is held out by all of them")
     experiment, _ = load_run(runs[0], None, trained.network)

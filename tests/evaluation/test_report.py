@@ -120,6 +120,18 @@ def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):
         report.evaluate(tmp_path, ["walk_3", "mine/walk_3.h5"])
 
 
+def test_a_model_none_of_whose_motions_is_here_is_refused(tmp_path, monkeypatch, capsys):
+    """The message says so, and does not name the first file that is missing."""
+    experiment = random_force_psi().experiment
+    settings = dataclasses.replace(experiment.config.evaluation, motions=("data/motion/take.motion.h5",))
+    experiment = experiment._replace(config=dataclasses.replace(experiment.config, evaluation=settings))
+    monkeypatch.setattr(trained, "configured", lambda _: experiment.config)
+    monkeypatch.setattr(report.Measured, "load", lambda *_: report.Measured(tmp_path, experiment, None, {}, None, 0))
+    with pytest.raises(ValueError, match="none of its validation motions is here; name others with --motions"):
+        report.evaluate_packed({"skirt": tmp_path})
+    assert "skirt: on no motion (data/motion/take.motion.h5 is not here)" in capsys.readouterr().out
+
+
 def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatch):
     forced = random_force_psi()
     models = {"network": {"w": np.ones(3)}, "predictor": {"v": np.ones(2)}}
