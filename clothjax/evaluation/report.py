@@ -68,12 +68,13 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, 
             absent = set(wanted) - set(present)
             print(f"{name}: on {', '.join(present) or 'no motion'}", *(f"({motion} is not here)" for motion in absent))
         reports[name] = _evaluated(folder, present, jobs=jobs)
-    for folder in folders.values():  # not before all of them are measured
-        _forget(folder)
     first, *others = (report["evaluation"] for report in reports.values())
     methods = [method for method in first if all(method in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
-    return {"mean": {method: _mean([each[method] for each in flat.values()]) for method in methods}} | flat
+    mean = {method: _mean([each[method] for each in flat.values()]) for method in methods}
+    for folder in folders.values():  # not before nothing can go wrong any more
+        _forget(folder)
+    return {"mean": mean} | flat
 
 
 def evaluate(
@@ -359,11 +360,12 @@ def _cell(value) -> str:
 
 
 def _mean(results: list[dict[str, float]]) -> dict[str, float]:
+    """Return means of the measures that all results have: without a body, there is nothing to be inside."""
     # a maximum over motions stays a maximum
     return {
         key: all(r[key] for r in results)
         if isinstance(value, bool)
         else float((np.max if "max" in key else np.mean)([r[key] for r in results]))
         for key, value in results[0].items()
-        if isinstance(value, bool | float)
+        if isinstance(value, bool | float) and all(key in r for r in results)
     }
