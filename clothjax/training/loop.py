@@ -99,9 +99,12 @@ def fit(
                     saved = time.monotonic()
                 if stop:
                     break
+        stop = stop or _anywhere(interrupted())  # one that came during the last save, or as a finished one was read
     if stop:
         name = signal.Signals(stop).name
-        progress.say(f"{name}: saved step {call.step} of {steps} in {directory}; run the same command again to go on")
+        progress.say(
+            f"{name}: saved step {_step(fitted.state)} of {steps} in {directory}; run the same command again to go on"
+        )
         raise SystemExit(128 + stop)
     return fitted
 

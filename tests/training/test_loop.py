@@ -174,6 +174,27 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path, straight):
     assert_same(train(tmp_path).state, straight[0])
 
 
+@pytest.mark.parametrize("during", ["_save", "_resume"])
+def test_a_signal_during_the_last_save_or_as_a_finished_stage_is_read_ends_the_program(
+    tmp_path, capsys, monkeypatch, during
+):
+    """Else the program would begin the next stage."""
+    if during == "_resume":
+        train(tmp_path)
+    unpatched = getattr(loop, during)
+
+    def signalled(*given):
+        result = unpatched(*given)
+        signal.raise_signal(signal.SIGTERM)
+        return result
+
+    monkeypatch.setattr(loop, during, signalled)
+    with pytest.raises(SystemExit) as ended:
+        train(tmp_path)
+    assert ended.value.code == 128 + signal.SIGTERM and "saved step 40 of 40" in capsys.readouterr().out
+    assert checkpoint.steps(tmp_path / "checkpoints")[-1] == 40
+
+
 def test_lines_of_progress(tmp_path, capsys):
     train(tmp_path, make_update(slow=0.1), report_seconds=0.25)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("step ")]
