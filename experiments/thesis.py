@@ -107,24 +107,24 @@ def networks(name: str, folder: Path, training: bool) -> dict[str, Path]:
 
 
 def finished(run: Path, config: Config | None = None) -> bool:
-    """Return whether the last stage of a run is at its last step.
+    """Return whether a run has been trained to its end.
 
     Raises:
         ValueError: if it was trained with another configuration than this.
     """
-    stages = [stage for stage in trained.STAGES if checkpoint.steps(run / stage / "checkpoints")]
-    if not stages:
+    if not checkpoint.steps(run / "stage1" / "checkpoints"):
         return False
     there = trained.configured(run)
     config = config or there
     differing = [name for name in TRAINED if getattr(there, name) != getattr(config, name)]
+    if assembly.training_motions(there) != assembly.training_motions(config):  # which are those not held out
+        differing = [*dict.fromkeys([*differing, "motions"])]
     if differing:
         raise ValueError(
             f"{run}: trained with another {' and '.join(differing)} than is configured now: move it away, or take "
             "--no-training"
         )
-    last = "stage1" if config.peer.network else [s for s in trained.STAGES if getattr(config, s).steps > 0][-1]
-    return stages[-1] == last and checkpoint.steps(run / last / "checkpoints")[-1] == getattr(config, last).steps
+    return not trained.unfinished(run)
 
 
 @functools.cache

@@ -133,9 +133,12 @@ def load_run(
 ) -> tuple[assembly.Experiment, dict]:
     """Load Phi of a run or a packed model: its experiment, and averaged `params` with `statistics`.
 
+    A run whose training is not finished is told by a warning.
+
     Args:
         evaluation: default: what the run was trained with.
         read: `trained.network` reads a baseline's network too.
     """
     config, model = read(directory)
+    trained.warn_of_unfinished(directory)
     return assembly.assemble(dataclasses.replace(config, evaluation=evaluation or config.evaluation)), model

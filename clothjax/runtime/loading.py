@@ -253,7 +253,7 @@ def crowd(models: Sequence[Model]) -> Model:
 def load(
     run: str | Path, *, betas: Array | None = None, material: Material | None = None, coarse: bool = False
 ) -> Model:
-    """Load the model of a finished run, or of a garment that comes with the library.
+    """Load the model of a run, or of a garment that comes with the library; warn of a run that is not finished.
 
     Args:
         run: the folder of a run or of a packed model, or a name from `trained.shipped()`, such as "skirt".
@@ -266,7 +266,9 @@ def load(
         ValueError: if the run has no readable checkpoint of stage 2, its assets are not found, or it is to be coarse
             and has no `model.felt`.
     """
-    config, decoder, predictor, normalizers = trained.psi(trained.find(run))
+    folder = trained.find(run)
+    config, decoder, predictor, normalizers = trained.psi(folder)
+    trained.warn_of_unfinished(folder)
     body, names = storage.load_rig(config.body)
     garment = storage.load_garment(config.garment, body, names)
     felt = storage.load_garment(config.model.felt, body, names) if config.model.felt else None

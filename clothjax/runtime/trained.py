@@ -8,6 +8,7 @@ there is the lower triangle, in half precision; the whitening of a Psi with forc
 
 import json
 import os
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -140,6 +141,29 @@ def configured(run: str | Path) -> Config:
     return configuration.from_dict(Config, checkpoint.latest(last).config, str(last), stored=True)
 
 
+def unfinished(run: str | Path) -> str:
+    """Return what the training of a run lacks, such as `stage2 is at step 40 of 6000`; nothing if it is finished.
+
+    Raises:
+        ValueError: if there is no readable configuration.
+    """
+    config = configured(run)
+    stages = ("stage1",) if config.peer.network else STAGES
+    for stage in () if packed(run) else stages:
+        forces = stage == "stage2" and config.stage2.forces
+        wanted = config.labels.all_steps if forces else getattr(config, stage).steps
+        done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
+        if done != wanted:
+            return f"{stage} is at step {done} of {wanted}"
+    return ""
+
+
+def warn_of_unfinished(run: str | Path) -> None:
+    """Warn whoever uses a run whose training has not ended: it is used as it is now."""
+    if lacking := unfinished(run):
+        warnings.warn(f"{run}: the training is not finished, {lacking}", stacklevel=3)
+
+
 def packed(run: str | Path) -> bool:
     """Return whether a folder holds a packed model."""
     return (Path(run) / WEIGHTS).is_file()
@@ -163,13 +187,8 @@ def pack(run: str | Path, out: str | Path) -> int:
     """
     config, model = phi(run)
     student = psi(run)
-    for stage in STAGES:
-        wanted = getattr(config, stage).steps
-        if stage == "stage2" and config.stage2.forces:
-            wanted = config.labels.all_steps
-        done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)
-        if done != wanted:
-            raise ValueError(f"{run}: {stage} is at step {done} of {wanted}: finish the training first")
+    if lacking := unfinished(run):
+        raise ValueError(f"{run}: {lacking}: finish the training first")
     decoder = checkpoint.named(model["params"]["garment"])
     if any((decoder[name] != leaf).any() for name, leaf in checkpoint.named(student.garment).items()):
         raise ValueError(

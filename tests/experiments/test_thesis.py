@@ -61,12 +61,16 @@ def test_the_garments_of_the_thesis_come_with_the_library():
 def test_a_run_of_another_configuration_is_not_taken_for_this_one(tmp_path, monkeypatch):
     config = small()
     monkeypatch.setattr(thesis.trained, "configured", lambda _: config)
-    monkeypatch.setattr(
-        thesis.checkpoint, "steps", lambda folder: [config.stage2.steps] if "stage2" in str(folder) else []
-    )
+    done = {"stage1": [config.stage1.steps], "stage2": [config.stage2.steps], "tuning": []}
+    monkeypatch.setattr(thesis.checkpoint, "steps", lambda folder: done[folder.parent.name])
     assert thesis.finished(tmp_path) and thesis.finished(tmp_path, dataclasses.replace(config, directory="elsewhere"))
     with pytest.raises(ValueError, match="trained with another fps than is configured now"):
         thesis.finished(tmp_path, dataclasses.replace(config, fps=60.0))
+    held_out = dataclasses.replace(config.evaluation, motions=("dance_3",))
+    with pytest.raises(ValueError, match="trained with another motions than"):
+        thesis.finished(tmp_path, dataclasses.replace(config, evaluation=held_out))
+    done["stage2"] = [20]
+    assert not thesis.finished(tmp_path)
 
 
 def test_until_a_garment_is_back():
