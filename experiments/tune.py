@@ -33,7 +33,8 @@ def main(argv: list[str]) -> None:
     folder = trained.find(arguments.model)
     if not trained.packed(folder):
         raise ValueError(f"{folder}: not a packed model; train a run further with `python -m clothjax train`")
-    config = configuration.cli(Config, [str(folder / trained.CONFIG), *settings, "--directory", str(arguments.out)])
+    given = [*settings, "--directory", str(arguments.out)]
+    config = configuration.load(Config, folder / trained.CONFIG, given, stored=True)
     if config.tuning.steps < 1:
         raise ValueError("tuning.steps is 0: give --tuning.steps")
     _, phi = trained.phi(folder)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from clothjax.body import motion_clips, reach
@@ -253,6 +254,26 @@ def test_a_packed_garment_is_tuned_on_other_motions(tmp_path):
         tune.main(["coat", "--out", str(tmp_path / "out")])
     with pytest.raises(ValueError, match=r"tuning\.steps is 0"):
         tune.main([str(tmp_path / "packed"), "--out", str(tmp_path / "none"), "--tuning.steps", "0"])
+
+
+def test_a_garment_is_tuned_as_it_was_trained_before_settings_were_there(tmp_path, monkeypatch):
+    """What a packed one of then lacks has the value of then: it had no forces."""
+    packed = tmp_path / "packed"
+    shutil.copytree(trained.find("tshirt_pose"), packed)
+    values = yaml.safe_load((packed / trained.CONFIG).read_text())
+    del values["stage2"]["forces"]
+    (packed / trained.CONFIG).write_text(yaml.safe_dump(values))
+    tuned = []
+
+    def assemble(config):
+        tuned.append(config)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tune.assembly, "assemble", assemble)
+    with pytest.raises(KeyboardInterrupt):
+        tune.main([str(packed), "--out", str(tmp_path / "out"), "--tuning.steps", "20"])
+    (config,) = tuned
+    assert not config.stage2.forces and config.tuning.steps == 20 and config.directory == str(tmp_path / "out")
 
 
 @pytest.mark.slow
