@@ -137,7 +137,7 @@ def readable(report: dict) -> str:
             )
     if "closed_loop" in report:
         loop = report["closed_loop"]
-        rows += ["", "| rollout | frames | not finite | outside training | code, sd | strain |", "|---" * 6 + "|"]
+        rows += ["", "| rollout | frames | not finite | outside training | code | strain |", "|---" * 6 + "|"]
         for name, case in loop["loops"].items():
             cells = (
                 case["frames"],
@@ -148,7 +148,8 @@ def readable(report: dict) -> str:
             )
             rows.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
         rows.append(
-            f"\nDrift on a frozen pose: Psi {loop['drift_mm']:.2f} mm, Phi {loop['phi_drift_mm']:.2f} mm. Frames after"
+            "\nOf the code it is the largest component, in standard deviations; with forces, in its own units."
+            f" Drift on a frozen pose: Psi {loop['drift_mm']:.2f} mm, Phi {loop['phi_drift_mm']:.2f} mm. Frames after"
             f" a shock until it is back: Psi {loop['recovery_frames']}, Phi after a jump {loop['phi_recovery_frames']}."
         )
     return "\n".join(rows)

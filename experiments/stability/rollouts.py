@@ -15,11 +15,11 @@ from clothjax.evaluation.rollouts import load_run, phi_trajectory, windows
 from clothjax.material import configured_material
 from clothjax.physics import incremental_potential
 from clothjax.runtime import inference, loading
-from clothjax.runtime.models import Model
+from clothjax.runtime.models import ForcePredictor, Model
 from clothjax.simulation import assembly, reference
 from clothjax.simulation.assembly import Experiment
 from clothjax.simulation.characters import Character
-from clothjax.types import Motion, Pose
+from clothjax.types import Motion, Pose, Rest
 from experiments.stability.solver import corners
 
 BEFORE = 60  # frames, until a shock
@@ -35,7 +35,7 @@ class Loop(NamedTuple):
     frames: int
     nonfinite: int  # frames
     flagged: int  # frames that the model says are outside the range of training
-    latent: float  # the largest component of the code, in standard deviations
+    latent: float  # the largest component of the code, in standard deviations; with forces, of a code in its own units
     strain: float  # the largest of an edge
 
 
@@ -48,7 +48,7 @@ class Shock(NamedTuple):
 
 
 def play(model: Model, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices [T, V, 3] m relative to the root, codes [T, L] in standard deviations, and `ok` [T]."""
+    """Return vertices [T, V, 3] m relative to the root, codes [T, L] as in `State`, and `ok` [T]."""
     vertices, latents, ok = _play(model, motion)
     root = np.nan_to_num(np.asarray(motion.translation, np.float32))
     return np.asarray(vertices) - root[:, None], np.asarray(latents), np.asarray(ok)
@@ -86,11 +86,9 @@ def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> di
     loops = {"long": measure(experiment, character, play(usual, assembly.there_and_back(clip, frames)))}
 
     for scale in (0.5, 2.0):
-        wearer = usual.wearer
-        model = replace(usual, wearer=wearer._replace(joints=scale * wearer.joints, template=scale * wearer.template))
         larger = character._replace(template=scale * character.template)
-        scaled = short._replace(translation=scale * short.translation)
-        loops[f"body scale {scale:g}"] = measure(experiment, larger, play(model, scaled))
+        farther = short._replace(translation=scale * short.translation)
+        loops[f"body scale {scale:g}"] = measure(experiment, larger, play(scaled(usual, scale), farther))
     for size in (-5.0, 5.0) if quick else (-5.0, -3.0, 3.0, 5.0):
         shape = np.full_like(betas, size)
         loops[f"betas {size:+g}"] = measure(experiment, dress(shape, cloth), play(load(betas=shape), short))
@@ -134,6 +132,30 @@ def stress(run, frames: int, quick: bool, progress: Callable[[int], None]) -> di
             "energy": relative,
         },
     }
+
+
+def scaled(model: Model, scale: float) -> Model:
+    """Return a model with a body so much larger, and a garment cut for it; blend shapes are as they are."""
+
+    def cut(rest: Rest) -> Rest:
+        return Rest(rest.inverse / scale, scale**2 * rest.face_area, scale**2 * rest.hinge_area, rest.hinge_angle)
+
+    wearer, predictor = model.wearer, model.network.predictor
+    wearer = wearer._replace(joints=scale * wearer.joints, template=scale * wearer.template)
+    if isinstance(predictor, ForcePredictor):
+        cloth = wearer.cloth
+        wearer = wearer._replace(
+            cloth=cloth._replace(
+                mass=scale**2 * cloth.mass,
+                rest=cut(cloth.rest),
+                body=scale * cloth.body,
+                template=None if cloth.template is None else scale * cloth.template,
+                shown=None if cloth.shown is None else cloth.shown._replace(rest=cut(cloth.shown.rest)),
+            )
+        )
+        corrections = None if predictor.corrections is None else scale * predictor.corrections
+        predictor = predictor._replace(corrections=corrections)
+    return replace(model, wearer=wearer, network=model.network._replace(predictor=predictor))
 
 
 def freeze(motion: Motion, start: int, frames: int) -> Motion:

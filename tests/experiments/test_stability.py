@@ -2,12 +2,15 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from toy import small
 
+from clothjax.files import storage
 from clothjax.physics import energies
+from clothjax.runtime import loading, trained
 from clothjax.simulation import assembly
 from clothjax.types import Motion
 from experiments.stability import physics, rollouts, solver
@@ -125,6 +128,24 @@ def test_a_motion_at_another_rate_is_where_it_was_at_that_time(fps):
         np.testing.assert_allclose(other.translation[index * step], clip.translation[same], atol=1e-5)
     turns = np.asarray(other.rotations, np.float64)
     np.testing.assert_allclose(turns @ np.swapaxes(turns, -1, -2), np.broadcast_to(np.eye(3), turns.shape), atol=1e-5)
+
+
+def test_on_a_larger_body_the_cloth_is_larger_too():
+    """What it weighs, its rest shape and how it relaxes are those of a garment cut so; its body grows."""
+    betas, name = np.linspace(-1, 1, 10).astype(np.float32), "skirt"
+    config, decoder, predictor, scales = trained.psi(trained.find(name))
+    body, names = storage.load_rig(config.body)
+    garment = storage.load_garment(config.garment, body)
+    cut = garment._replace(vertices=2 * garment.vertices, shapedirs=2 * garment.shapedirs)
+    whole = body._replace(vertices=2 * body.vertices, joints=2 * body.joints, shapedirs=2 * body.shapedirs)
+    whole = whole._replace(joint_shapedirs=2 * body.joint_shapedirs)
+    expected = loading.build(config, cut, whole, names, decoder, predictor, scales, betas=betas).wearer
+    usual = loading.load(name, betas=betas)
+    found = rollouts.scaled(usual, 2.0).wearer
+    np.testing.assert_allclose(found.cloth.body, 2 * usual.wearer.cloth.body)
+    expected = expected._replace(cloth=expected.cloth._replace(body=found.cloth.body))  # the part within reach differs
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-6)
 
 
 def test_a_frozen_motion_stands_still():
