@@ -282,7 +282,10 @@ class Stage1Config(PhysicsTrainingConfig):
 
 @dataclass(frozen=True)
 class TuningConfig(PhysicsTrainingConfig):
-    """Fine-tuning of Psi after its regression, on the bodies of `stage1.betas`."""
+    """Fine-tuning of Psi after its regression, on the bodies of `stage1.betas`.
+
+    A Psi with forces does not read `preconditioning`: its whitening takes that place.
+    """
 
     steps: int = 0
     pool: int = 192

@@ -86,7 +86,8 @@ def animator(
     Args:
         phi: parameters of Phi.
         garment: parameters of the decoder.
-        normalizers: of Psi; `ForceScales` are those of a Psi with forces, whose whitening preconditions it.
+        normalizers: of Psi; `ForceScales` are those of a Psi with forces, whose whitening preconditions it in place of
+            `tuning.preconditioning`.
     """
     if isinstance(normalizers, ForceScales):
         return force_psi_animator(garment, normalizers)
