@@ -20,7 +20,7 @@ from clothjax.types import Array
 
 SMALL = 0.3  # of the mean square of an ordinary change; frames that change less weigh no more
 WIDER = 0.1  # of the range of the labels' codes, which Psi may go beyond at either end
-SETTLING = 0.35  # share of the training steps of all rounds, the last ones, in which the learning rate falls, ...
+SETTLING = 0.35  # share of the training steps of all rounds, the last ones, in which the rate falls (not `anew`), ...
 LAST_SETTLING = 0.6  # ... and of those on all frames
 OWN_RIDGE, BIAS_RIDGE = 10.0, 1e-3  # penalties on what the linear map takes of a direction's own inputs, and on biases
 
@@ -141,7 +141,8 @@ def weight(targets: Array) -> Array:
 def optimizer(config: Config, last: bool = False) -> optax.GradientTransformation:
     """Build AdamW, whose rate stays and then falls along a line to zero: at the end of all rounds, or of the `last`.
 
-    A linear map that stays as it is does not decay.
+    Where each round begins anew (`labels.anew`), its steps count from 0: the rate falls in the `last` training alone. A
+    linear map that stays as it is does not decay.
     """
     settings = config.labels
     steps, settling = settings.rounds * settings.steps, SETTLING
