@@ -18,7 +18,6 @@ from clothjax import cli
 from clothjax.config import Config
 from clothjax.evaluation import pictures
 from clothjax.evaluation.report import evaluate, table
-from clothjax.evaluation.rollouts import load_run
 from clothjax.export.onnx import run_onnx, to_onnx
 from clothjax.files import configuration
 from clothjax.render.gltf import to_glb
@@ -43,7 +42,7 @@ def main(argv: list[str]) -> None:
 
     print("measuring against the reference solver")
     report = evaluate(directory, settings=config.evaluation)
-    experiment, _ = load_run(directory, config.evaluation)
+    experiment = assembly.assemble(config)
     motion = config.evaluation.motions[0]
     betas = assembly.betas(config)
 

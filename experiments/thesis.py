@@ -27,7 +27,7 @@ from clothjax import cli
 from clothjax.config import Config
 from clothjax.evaluation import pictures
 from clothjax.evaluation.report import evaluate
-from clothjax.evaluation.rollouts import Tracks, load_run
+from clothjax.evaluation.rollouts import Tracks
 from clothjax.files import checkpoint, configuration
 from clothjax.render import ray_cast
 from clothjax.runtime import inference, loading, trained
@@ -201,7 +201,7 @@ def failure(runs: Runs) -> tuple[dict, Section]:
     if garment is None:
         return {}, (title, "<p>Needs a run of ours.</p>")
     run = runs[garment]["ours"]
-    experiment, _ = load_run(run)
+    experiment = assembly.assemble(trained.configured(run))
     model = loading.load(run, betas=assembly.betas(experiment.config))
     everywhere = Bounds(*(jnp.full_like(model.network.first, x) for x in (-1e9, 1e9, 0.0)))
     free = dataclasses.replace(model, network=model.network._replace(code_bounds=everywhere))

@@ -23,9 +23,9 @@ from pathlib import Path
 
 from clothjax import cli
 from clothjax.evaluation.pictures import FILMS, WRITERS, perform, perform_beside, perform_skinned, write_comparison
-from clothjax.evaluation.rollouts import load_run
 from clothjax.render.skinned_gltf import to_skinned_glb
 from clothjax.runtime import trained
+from clothjax.simulation import assembly
 
 
 def main(argv: list[str]) -> None:
@@ -60,9 +60,11 @@ def main(argv: list[str]) -> None:
     if arguments.betas and not arguments.skinned:
         raise ValueError("--betas is of --skinned; other files show the body of the evaluation")
     run = trained.find(arguments.model)
-    experiment, _ = load_run(run)
-    motions = arguments.motions or experiment.config.evaluation.motions[:1]
-    frames = arguments.frames or experiment.config.evaluation.animation_frames
+    config = trained.configured(run)
+    trained.refuse_baseline(run, config)
+    experiment = assembly.assemble(config)
+    motions = arguments.motions or config.evaluation.motions[:1]
+    frames = arguments.frames or config.evaluation.animation_frames
     outs = {motion: _out(arguments.out, motion if len(motions) > 1 else None) for motion in motions}
     if len(set(outs.values())) < len(motions):
         raise ValueError(f"two motions have one name: {', '.join(motions)}; rename one")

@@ -156,11 +156,9 @@ def decode(
 def felt(
     garment: Params, scene: Scene, character: Character, latent: Array, frame: Frame, config: ModelConfig
 ) -> Array:
-    """Decode a code [L] to the garment that feels, [Vf, 3] m at a frame; arguments of `decode`."""
+    """Decode a code [L] to the garment of `model.felt`, [Vf, 3] m at a frame; arguments of `decode`."""
+    assert scene.felt is not None and character.felt is not None
     unrelaxed = skinned(displacement(garment, scene, latent, config), scene, character, frame)
-    if scene.felt is None:
-        return relaxed(unrelaxed, scene.garment, scene.mesh, character.rest, character.material, config)
-    assert character.felt is not None
     cloth, mesh = scene.felt.garment, scene.felt.mesh
     return relaxed(unrelaxed, cloth, mesh, character.felt.rest, character.material, config)
 

@@ -72,12 +72,17 @@ def phi(run: str | Path) -> tuple[Config, dict]:
         ValueError: if there is no readable Phi, as in a baseline's run.
     """
     config, model = network(run)
+    refuse_baseline(run, config)
+    return config, model
+
+
+def refuse_baseline(run: str | Path, config: Config) -> None:
+    """Raise a ValueError if a run, of that configuration, is of a baseline."""
     if config.peer.network:
         raise ValueError(
             f"{run}: is of a baseline ({config.peer.network}), which has no Phi: only `clothjax evaluate` and "
             "experiments.benchmark use it"
         )
-    return config, model
 
 
 def network(run: str | Path) -> tuple[Config, dict]:

@@ -198,7 +198,6 @@ def linear_map(data: Data, scales: ForceScales, config: Config) -> dict[str, Arr
         add, (jnp.zeros((size + 1, size + 1)), jnp.zeros((size + 1, data.targets.shape[1]))), rows
     )
     latent = data.targets.shape[1]
-    latent = data.targets.shape[1]
 
     def solved(squares: Array, products: Array, penalty: Array) -> Array:
         return jax.scipy.linalg.solve(squares + jnp.diag(jnp.append(penalty, BIAS_RIDGE)), products, assume_a="pos")

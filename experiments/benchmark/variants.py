@@ -13,7 +13,7 @@ from clothjax import material
 from clothjax.body import skinning
 from clothjax.config import Config
 from clothjax.evaluation import rollouts
-from clothjax.evaluation.rollouts import load_run, relative, skinned_trajectory, windows
+from clothjax.evaluation.rollouts import relative, skinned_trajectory, windows
 from clothjax.export import native, onnx
 from clothjax.export.onnx_graph import Graph
 from clothjax.networks import psi
@@ -74,7 +74,7 @@ def prepare(runs: list[Path], motions: tuple[str, ...], frames: int) -> Case:
     names = motions or assembly.present(shared)
     if not names:
         raise ValueError(f"{', '.join(map(str, runs))}: no motion is held out by all of them")
-    experiment, _ = load_run(runs[0], None, trained.network)
+    experiment = assembly.assemble(first)
     character = assembly.dress(experiment, assembly.betas(first), material.configured_material(first))
     clips = [assembly.motion(experiment, name) for name in names]
     clips = [Motion(clip.rotations[: frames + 2], clip.translation[: frames + 2], clip.fps) for clip in clips]

@@ -85,7 +85,7 @@ def test_it_is_the_animator_of_training(kind, motion, request):
 
     @jax.jit
     def begun(code, poses):
-        """Where a garment that is shown alone is, and where codes put the one that feels."""
+        """Where a garment that is shown is, and where codes put the one that feels in its place."""
         window = characters.window(scene, character, poses)
         felt = phi.felt(forced.garment, scene, character, code, window.following, config.model)
         return time_step.start(character, window, len(code)), felt - poses.translation[2][None]

@@ -7,6 +7,7 @@ import pytest
 from samples import settings
 from toy import small
 
+from clothjax.commands import render
 from clothjax.evaluation import rollouts
 from clothjax.files import checkpoint, configuration
 from clothjax.runtime import loading, trained
@@ -39,9 +40,11 @@ def test_a_stage_2_with_forces_has_the_steps_of_its_labels(tmp_path):
     assert not trained.unfinished(tmp_path)
 
 
-def test_a_baseline_has_one_stage(tmp_path):
+def test_a_baseline_has_one_stage_and_is_not_drawn(tmp_path):
     save(tmp_path, "stage1", 40, settings("ncs"))
     assert not trained.unfinished(tmp_path)
+    with pytest.raises(ValueError, match=r"is of a baseline \(ncs\), which has no Phi"):
+        render.main([str(tmp_path), "--out", str(tmp_path / "picture.webp")])
 
 
 def test_who_uses_a_run_that_is_not_finished_is_told(tmp_path, monkeypatch):
