@@ -89,7 +89,7 @@ class Contact(NamedTuple):
     point_next: Array  # [V, 3] m, the same surface point at the next frame
     normal: Array  # [V, 3] at the current frame
     normal_next: Array  # [V, 3] at the next frame
-    index: Array  # [V] int32, a body vertex beside it
+    index: Array  # [V] int32, a body vertex beside it; of planes that Psi feels, the body's face
 
 
 class EdgeContact(NamedTuple):

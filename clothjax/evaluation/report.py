@@ -152,7 +152,7 @@ class Measured(NamedTuple):
     character: Character
     methods: dict[str, Method]
     blendshapes: np.ndarray | None  # of Phi, [K, V, 3] m; None where there is no Phi
-    networks: int  # their number, of `rollouts.networks`
+    fingerprint: int  # of its networks, of `rollouts.fingerprint`
 
     @classmethod
     def load(cls, run: Path, settings: EvaluationConfig | None = None) -> "Measured":
@@ -161,7 +161,7 @@ class Measured(NamedTuple):
         config = experiment.config
         character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
         shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-        return cls(run, experiment, character, _methods(experiment, model, run), shapes, rollouts.networks(run))
+        return cls(run, experiment, character, _methods(experiment, model, run), shapes, rollouts.fingerprint(run))
 
 
 def _parts_file(run: Path) -> Path:
@@ -176,7 +176,7 @@ def _forget(run: Path) -> None:
 def _fingerprint(measured: Measured) -> int:
     """Return a number that tells evaluations of other models, or with other settings, apart."""
     settings = configuration.to_dict(measured.experiment.config)
-    return run_folder.fingerprint(settings | {"networks": measured.networks})
+    return run_folder.fingerprint(settings | {"networks": measured.fingerprint})
 
 
 def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
@@ -184,7 +184,7 @@ def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
     run, experiment, character, methods, shapes, _ = measured
     clip = assembly.evaluation_motion(experiment, name)
     tracks, converged = simulate(experiment, methods, character, clip)
-    tracks.save(run, name, measured.networks)
+    tracks.save(run, name, measured.fingerprint)
     return measure(experiment, character, clip, tracks, converged, shapes)
 
 

@@ -34,7 +34,7 @@ class Tracks(NamedTuple):
         """Save the trajectories in a run's folder, for pictures.
 
         Args:
-            of: the number of the `networks` that they are of.
+            of: the `fingerprint` of the networks that they are of.
         """
         arrays: dict[str, Any] = {name: np.asarray(track, np.float32) for name, track in self.methods.items()}
         np.savez_compressed(_tracks_path(run, motion), **arrays, solver=self.solver, networks=of)
@@ -51,13 +51,13 @@ class Tracks(NamedTuple):
             raise ValueError(f"{path}: no such file; {advice}")
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
-        if arrays.pop("networks", None) != networks(run):
+        if arrays.pop("networks", None) != fingerprint(run):
             raise ValueError(f"{path}: of other networks than {run} has now, or of an older clothjax; {advice}")
         solver = arrays.pop("solver")
         return cls(arrays, solver)
 
 
-def networks(run: Path) -> int:
+def fingerprint(run: Path) -> int:
     """Return a number that tells the networks of runs apart: of what is stored, not of what each machine computes."""
     config, model = trained.network(run)
     if config.peer.network:
@@ -79,7 +79,7 @@ def _tracks_path(run: Path, motion: str) -> Path:
 
 def windows(clip: Motion) -> Pose:
     """Return all windows [T - 2, 3, ...] of a clip of T frames, one around each frame but the first and the last."""
-    clips = jax.tree.map(jnp.asarray, assembly.windows(clip))
+    clips = jax.tree.map(jnp.asarray, assembly.as_clips(clip))
     return jax.vmap(lambda t: motion_clips.poses(clips, t))(jnp.arange(1, len(clip.translation) - 1))
 
 

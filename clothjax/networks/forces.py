@@ -47,7 +47,7 @@ def touching_edges(mesh: Mesh, config: PhysicsConfig) -> Array:
     return mesh.edges if config.edge_contact else mesh.edges[:0]
 
 
-def felt(position: Array, surface: tuple[Array, Array], clusters: Clusters, edges: Array) -> Contact:
+def felt_planes(position: Array, surface: tuple[Array, Array], clusters: Clusters, edges: Array) -> Contact:
     """Return the planes that Psi feels, `raised`: of the body's face whose centroid is nearest to a vertex.
 
     Args:
@@ -60,7 +60,7 @@ def felt(position: Array, surface: tuple[Array, Array], clusters: Clusters, edge
 
 
 def planes_of(surface: tuple[Array, Array], face: Array) -> Contact:
-    """Return the planes [V] of faces [V] of a surface, as of `felt`."""
+    """Return the planes [V] of faces [V] of a surface, as of `felt_planes`."""
     point, normal = (row[face] for row in surface)
     return Contact(point, point, normal, normal, face)
 
@@ -69,7 +69,7 @@ def raised(planes: Contact, position: Array, edges: Array, times: float = 1.0) -
     """Return planes that are raised, so that edges over a round body stay outside of it between their ends.
 
     That is by the height of an arc over its chord, (n_a - n_b) . (x_a - x_b) / 8 for normals n at its ends x. A vertex
-    has that of its highest edge. Arguments as of `felt`.
+    has that of its highest edge. Arguments as of `felt_planes`.
 
     Args:
         times: how many heights.
@@ -87,7 +87,7 @@ def on_vertices(position: Array, step: TimeStep, mesh: Mesh, config: PhysicsConf
 
     Args:
         position: [V, 3] m, the held garment at the next frame.
-        step: the time step, with the contact of `felt`, which pushes by `spring`.
+        step: the time step, with the contact of `felt_planes`, which pushes by `spring`.
     """
 
     def force(names: tuple[str, ...]) -> Array:
@@ -118,11 +118,11 @@ def reduced(
         garment: from a code to vertices [V, 3] m at the next frame, before relaxation.
         held: [V, 3] m, the garment of now in the pose of the next frame.
         step: the time step; its contact is not used.
-        surface, clusters: as of `felt`; None where there is no body to touch.
+        surface, clusters: as of `felt_planes`; None where there is no body to touch.
     """
     _, pullback = jax.vjp(garment, code)
     edges = touching_edges(mesh, config)
-    touched = None if surface is None or clusters is None else felt(held, surface, clusters, edges)
+    touched = None if surface is None or clusters is None else felt_planes(held, surface, clusters, edges)
     step = step._replace(contact=touched)
     forces = on_vertices(held, step, mesh, config)
     return jax.vmap(lambda force: pullback(force)[0])(forces)

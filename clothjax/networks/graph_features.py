@@ -58,7 +58,7 @@ def compute(
     window: Window,
     contact: Contact | None,
     timestep: Array,
-    held: Array,
+    guess: Array,
     force: Array,
     model: ModelConfig,
     material: MaterialConfig,
@@ -68,8 +68,8 @@ def compute(
     Args:
         contact: planes at the body points nearest to the garment now; None where there is no body.
         timestep: s.
-        held: [V, 3] m, the next positions if the canonical displacement stayed the same.
-        force: [V, 3] N on the garment at `held`, minus the potential's gradient.
+        guess: [V, 3] m, of the next positions: where the descent ends, else where the canonical displacement stays.
+        force: [V, 3] N on the garment at `guess`, minus the potential's gradient.
     """
     turn = window.current.heading.T
     inputs = material_inputs(character.material, material)
@@ -92,8 +92,8 @@ def compute(
     edge_points = {"now": state.position}
     extra = jnp.zeros((len(garment), 0), garment.dtype)
     if model.canonical_features:
-        extra, drifted = _canonical(character, state, window, contact, held, force)
-        edge_points |= {"held": held, "drifted": drifted}
+        extra, drifted = _canonical(character, state, window, contact, guess, force)
+        edge_points |= {"guess": guess, "drifted": drifted}
     edges = {
         name: mesh_edges(graph.senders, graph.receivers, edge_points, character.template, turn, timestep, inputs)
         for name, graph in scene.graph.items()
@@ -159,12 +159,12 @@ def world_edges(offset_now: Array, offset_next: Array, turn: Array, timestep: Ar
 
 
 def _canonical(
-    character: Character, state: ClothState, window: Window, contact: Contact | None, held: Array, force: Array
+    character: Character, state: ClothState, window: Window, contact: Contact | None, guess: Array, force: Array
 ):
     """Express the state in the next frame's canonical pose, [V, 22], or [V, 15] without a body; also return `drifted`.
 
-    `held` keeps the canonical displacement, `drifted` [V, 3] m keeps the velocity. The next position lies, roughly,
-    between these two guesses, and contact is measured from both. The force at `held` is divided by the weight of the
+    `guess` is that of `compute`, `drifted` [V, 3] m keeps the velocity. The next position lies, roughly,
+    between these two guesses, and contact is measured from both. The force at `guess` is divided by the weight of the
     vertex and compressed, since it spans five decades.
     """
     following = window.following.garment
@@ -184,7 +184,7 @@ def _canonical(
         columns.append(skinning.unapply_direction(following, contact.normal_next))
     columns.append(character.template)
     if contact is not None:
-        gaps = [contact_search.distance(x, contact.point_next, contact.normal_next)[:, None] for x in (held, drifted)]
+        gaps = [contact_search.distance(x, contact.point_next, contact.normal_next)[:, None] for x in (guess, drifted)]
         columns += [jnp.clip(gap, -0.05, 0.05) for gap in gaps]
         columns += [jnp.maximum(0.003 - gap, 0.0) for gap in gaps]
     return jnp.concatenate(columns, axis=-1), drifted
@@ -195,7 +195,7 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs) -> 
 
     Args:
         senders, receivers: [E] vertex indices.
-        points: [V, 3] m by name: `now`, and the guesses `held` and `drifted` where there are any.
+        points: [V, 3] m by name: `now`, and the guesses `guess` and `drifted` where there are any.
         template: [V, 3] m, at rest.
         turn: [3, 3] into the frame of the features.
         timestep: s.
@@ -205,7 +205,7 @@ def mesh_edges(senders, receivers, points, template, turn, timestep, inputs) -> 
     rest_length = norm(rest, keepdims=True)
     now = points["now"][senders] - points["now"][receivers]
     columns = [_rotate(turn, now), norm(now, keepdims=True), rest, rest_length]
-    for name in ("held", "drifted"):
+    for name in ("guess", "drifted"):
         if name in points:
             vector = points[name][senders] - points[name][receivers]
             columns.append(norm(vector, keepdims=True) / rest_length - 1.0)

@@ -127,7 +127,7 @@ def present(motions: Sequence[str]) -> list[str]:
     return [name for name in motions if storage.asset(name).is_file()]
 
 
-def windows(clip: Motion) -> Clips:
+def as_clips(clip: Motion) -> Clips:
     """Return one motion as `Clips`, in which every frame but the first and the last has a window."""
     return motion_clips.concatenate([clip], [""], [np.zeros(0, int)], 1)
 

@@ -159,7 +159,7 @@ def precision(config: Config, away: float = 0.0) -> dict[str, dict[str, float]]:
     character = characters.dress(
         scene, jnp.asarray(assembly.betas(config)), material.configured_material(config), config.physics
     )
-    windows = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, config.evaluation.motions[0])))
+    windows = jax.tree.map(jnp.asarray, assembly.as_clips(assembly.motion(experiment, config.evaluation.motions[0])))
 
     @jax.jit
     def state(key):

@@ -139,7 +139,9 @@ def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatc
     monkeypatch.setattr(trained, "psi", lambda _: trained.TrainedPsi(None, {}, models["predictor"], ()))
 
     def number(experiment=forced.experiment):
-        return report._fingerprint(report.Measured(tmp_path, experiment, None, {}, None, rollouts.networks(tmp_path)))
+        return report._fingerprint(
+            report.Measured(tmp_path, experiment, None, {}, None, rollouts.fingerprint(tmp_path))
+        )
 
     first, config = number(), forced.experiment.config
     settings = dataclasses.replace(config.evaluation, gap_frames=config.evaluation.gap_frames + 1)
@@ -156,7 +158,7 @@ def test_trajectories_of_other_networks_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run, track = trained.find("tshirt"), np.ones((2, 3, 3), np.float32)
     rollouts.output_folder(run).mkdir(parents=True)
-    rollouts.Tracks({"lbs": track, "psi": 2 * track}, 3 * track).save(run, "walk_3", rollouts.networks(run))
+    rollouts.Tracks({"lbs": track, "psi": 2 * track}, 3 * track).save(run, "walk_3", rollouts.fingerprint(run))
     psi, (config, phi) = trained.psi(run), trained.network(run)
 
     def load(psi=psi, phi=phi):

@@ -61,7 +61,7 @@ def test_planes_over_a_round_body_are_raised_by_the_height_of_its_arcs(radius, l
     corners = radius * normals[np.arange(count) * 4000 // count]
     edges = np.stack([np.arange(count), np.roll(np.arange(count), -1)], axis=1)
     near = clusters.divided(corners, radius * normals)
-    planes = forces.felt(jnp.asarray(corners), (radius * normals, normals), near, jnp.asarray(edges))
+    planes = forces.felt_planes(jnp.asarray(corners), (radius * normals, normals), near, jnp.asarray(edges))
     middles = np.asarray(planes.point_next)[edges].mean(axis=1)
     apart = np.linalg.norm(middles, axis=1) - radius
     height = radius * (1 - np.cos(np.pi / count))
@@ -76,7 +76,9 @@ def test_planes_of_a_hollow_and_of_a_flat_body_are_not_raised_and_none_by_more_t
 
     def raised(normals, scale=1.0):
         at = jnp.asarray(scale * inside)
-        planes = forces.felt(at, (scale * jnp.asarray(faces[:, 0]), jnp.asarray(normals)), near, jnp.asarray(edges))
+        planes = forces.felt_planes(
+            at, (scale * jnp.asarray(faces[:, 0]), jnp.asarray(normals)), near, jnp.asarray(edges)
+        )
         return np.linalg.norm(planes.point_next - at, axis=1)
 
     np.testing.assert_array_equal(raised(normals), 0.0)

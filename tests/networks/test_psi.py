@@ -128,7 +128,7 @@ def test_motions_of_training_are_ordinary_though_the_teacher_did_not_play_them()
     teacher = Teacher(latents, rows[None, :6], np.zeros((1, 3), np.float32))
 
     def ordinary(normalizers, name):
-        poses = assembly.windows(assembly.motion(experiment, name))
+        poses = assembly.as_clips(assembly.motion(experiment, name))
         joints = skinning.shaped_joints(experiment.body, jnp.zeros(10))
 
         def one(frame):

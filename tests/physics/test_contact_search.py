@@ -137,7 +137,7 @@ def test_the_part_of_the_body_within_reach_stands_for_the_whole():
     experiment = assembly.assemble(config)
     scene = experiment.scene
     character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "run_3")))
+    reel = jax.tree.map(jnp.asarray, assembly.as_clips(assembly.motion(experiment, "run_3")))
     poses = motion_clips.poses(reel, jnp.int32(40))
     window = characters.window(scene, character, poses)
     state = time_step.start(character, window, 0)
@@ -285,7 +285,7 @@ def test_a_time_step_leaves_planes_behind():
     experiment = assembly.assemble(config)
     scene, mesh = experiment.scene, experiment.scene.mesh
     character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "walk_0")))
+    reel = jax.tree.map(jnp.asarray, assembly.as_clips(assembly.motion(experiment, "walk_0")))
     poses = motion_clips.poses(reel, jnp.int32(40))
     leap = poses._replace(translation=jnp.zeros((3, 3)).at[2, 2].set(0.12))
     window = characters.window(scene, character, leap)
@@ -373,7 +373,7 @@ def test_edges_of_a_garment_touch_what_is_nearest_to_them():
     experiment = assembly.assemble(config)
     scene, mesh = experiment.scene, experiment.scene.mesh
     character = characters.dress(scene, jnp.zeros(10), material.configured_material(config), config.physics)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "run_3")))
+    reel = jax.tree.map(jnp.asarray, assembly.as_clips(assembly.motion(experiment, "run_3")))
     near = lost = 0
     for frame in (20, 40, 60):
         window = characters.window(scene, character, motion_clips.poses(reel, jnp.int32(frame)))

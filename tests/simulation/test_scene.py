@@ -89,7 +89,7 @@ def _step(experiment, pose):
 
 @pytest.fixture(scope="module")
 def pose(experiment):
-    reel = jax.tree.map(jnp.asarray, assembly.windows(assembly.motion(experiment, "walk_0")))
+    reel = jax.tree.map(jnp.asarray, assembly.as_clips(assembly.motion(experiment, "walk_0")))
     return motion_clips.poses(reel, jnp.int32(20))
 
 
@@ -138,7 +138,7 @@ def test_a_flag_falls_from_its_pole(experiment):
     config = flag.config
     still = storage.load_motion("walk_3", experiment.names)
     still = Motion(np.repeat(still.rotations[:1], 14, 0), np.repeat(still.translation[:1], 14, 0), still.fps)
-    reel = jax.tree.map(jnp.asarray, assembly.windows(still))
+    reel = jax.tree.map(jnp.asarray, assembly.as_clips(still))
     poses = jax.vmap(lambda t: motion_clips.poses(reel, t))(jnp.arange(1, 13))
     character = characters.dress(flag.scene, jnp.zeros(10), material.configured_material(config), config.physics)
     quick = dataclasses.replace(config, stage1=dataclasses.replace(config.stage1, start_timestep=0.0))

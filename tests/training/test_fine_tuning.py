@@ -48,7 +48,7 @@ def test_psi_in_training_is_psi_in_use(toy):
     animate = animators.psi_animator(garment, normalizers, kept)(
         {"params": predictor}, experiment.scene, character, config
     )
-    around = motion_clips.poses(jax.tree.map(jnp.asarray, assembly.windows(clip)), 2)
+    around = motion_clips.poses(jax.tree.map(jnp.asarray, assembly.as_clips(clip)), 2)
     window = characters.window(experiment.scene, character, around)
     code = normalisation.denormalise(normalizers.latent, state.latent)
     cloth = ClothState(jnp.zeros_like(vertices), jnp.zeros_like(vertices), jnp.zeros_like(vertices), code, 0 * code)

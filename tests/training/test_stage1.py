@@ -138,7 +138,7 @@ def test_phi_does_not_see_place_or_heading(toy, update):
 
 
 def _windows(motion):
-    poses = jax.tree.map(jnp.asarray, assembly.windows(motion))
+    poses = jax.tree.map(jnp.asarray, assembly.as_clips(motion))
     return jax.vmap(lambda t: motion_clips.poses(poses, t))(jnp.arange(1, 20))
 
 
