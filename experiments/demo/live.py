@@ -112,7 +112,7 @@ class Comparison:
     def __init__(self, run: Path):
         self.config, model = trained.phi(run)
         self.scene, config = assembly.assemble(self.config).scene, self.config
-        self.faces = np.asarray(self.scene.mesh.faces)
+        self.faces = np.asarray(self.scene.garment.faces)
         model = jax.tree.map(jnp.asarray, model)
 
         def phi(character):

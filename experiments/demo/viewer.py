@@ -6,7 +6,7 @@
 
 Keys: I walks, then runs; K slows; J and L turn; space jumps, if there is a clip called jump. W, A, S, D, Q, E and the
 arrows are the viewer's own, for its camera. The panel repeats the keys and chooses garment, body and cloth, wind for
-the skirt, and the methods beside Psi: plain skinning, its teacher Phi, and the solver, for which all others then wait.
+garments with forces, and the methods beside Psi: plain skinning, Phi, and the solver, for which all others then wait.
 """
 
 import argparse
@@ -146,6 +146,7 @@ class Viewer:
         run = self.garments[self.garment.value]
         self.show.dress(run, betas, material, int(self.count.value), self.fine.value)
         self.wind.visible = self.show.outfit.feels_wind
+        self.fine.visible = finer(trained.configured(run)) is not None
 
     def _remove_meshes(self) -> None:
         self._draw_anew = False

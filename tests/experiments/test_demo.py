@@ -203,6 +203,18 @@ def viewer():
     viewer.server.stop()
 
 
+def test_faces_of_pinned_vertices_are_shown_beside_psi_too(monkeypatch):
+    load = storage.load_garment
+
+    def pinned_above(name, body):
+        garment = load(name, body)
+        height = np.asarray(garment.vertices)[:, 1]
+        return garment._replace(pinned=height > np.median(height))
+
+    monkeypatch.setattr(storage, "load_garment", pinned_above)
+    np.testing.assert_array_equal(live.Comparison(SKIRT).faces, load("skirt_1000", storage.load_body("body")).faces)
+
+
 def test_the_panel_reaches_what_is_shown(viewer):
     viewer.run(20)
     assert set(viewer.meshes) == {"/psi/0", "/body/0"} and "frames a second" in viewer.text.content
@@ -225,6 +237,11 @@ def test_the_panel_reaches_what_is_shown(viewer):
     }
     here, there = (np.array(viewer.meshes[f"/{method}/name"].position) for method in ("psi", "skinning"))
     np.testing.assert_allclose(there - here, [live.APART, 0, 0], atol=1e-5)
+    assert viewer.fine.visible
+    viewer.show.dress = lambda *_: None  # it would take long
+    viewer.garment.value = "dress_fine"
+    viewer._dress()
+    assert not viewer.fine.visible
 
 
 def test_what_is_inside_the_body_is_red(viewer):
