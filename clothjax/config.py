@@ -432,7 +432,8 @@ class EvaluationConfig:
     gap_frames: int = 10
     """Frames at which the reference solver runs."""
     solver_frames: int = 60
-    """Frames of the reference solver's own rollout, for jitter and pictures."""
+    """Frames of the reference solver's own rollout. Swing, wrinkles, jitter, the ratio of strains and the error of a
+    rollout are measured over these, and pictures show it."""
     long_frames: int = 1000
     """Frames of the long autoregressive rollout, with the motion repeated."""
     wearers: bool = False

@@ -15,8 +15,8 @@ and maxima stand beside them.
                     0 is the solver, 1 plain skinning. The mean is of sums over the frames sampled.
     hold_gap        the same with E_hold for E_skinned, where E_hold is of persistence: the last canonical displacement
                     again. 1 is no dynamics at all.
-    span_gap        the same with the minimum in the span of the learned blend shapes for E: the part of Phi's gap that
-                    comes from the shapes, if nothing relaxes; training could close the rest.
+    span_gap        the same with the minimum in the span of the blend shapes for E: the part of Phi's gap that comes
+                    from the shapes, if nothing relaxes; training could close the rest.
     step_error_mm   mean (`_p95`, `_max`) distance of vertices to that minimum.
     penetration_percent, penetration_max_mm   vertices inside the whole body (winding number), and the deepest;
                     `penetration_by_joint` counts them by joint for each motion.

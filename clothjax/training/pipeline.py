@@ -197,7 +197,7 @@ def train_psi(run: Run, phi: loop.Fitted) -> tuple[loop.Fitted, dict[str, float]
     model = {"params": phi.state.average, "statistics": phi.state.statistics}
     progress.say(f"stage 2: the latent predictor, {stage.steps} steps on {stage.sequences} rollouts of Phi")
     if run.steps("stage2")[-1:] == [stage.steps]:
-        # if it cannot be read, training goes on from the one before, and stops at the first NaN
+        # if it cannot be read, training goes on from the one before, and stops as its steps are not finite
         teacher, seconds = stage2.blank(model, scene, run.clips, joints, config), 0.0
     else:
         if run.steps("tuning"):  # it must not be taken for that of the new stage 2

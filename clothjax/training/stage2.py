@@ -74,8 +74,8 @@ def make_rollout(scene: Scene, input_joints: np.ndarray, config: Config) -> Call
 def blank(model: dict, scene: Scene, clips: Clips, input_joints: np.ndarray, config: Config) -> Teacher:
     """Return a teacher of one rollout, all NaN, for a stage 2 that is finished and is only read.
 
-    It has the shapes that the state of training needs, and spares rolling Phi out. A training step on it would stop at
-    a loss of NaN.
+    It has the shapes that the state of training needs, and spares rolling Phi out. Training steps on it are skipped, of
+    which `loop.fit` tolerates few.
     """
     shapes = jax.eval_shape(make_rollout(scene, input_joints, config), jax.random.key(0), model, clips)
     return jax.tree.map(lambda part: np.full((1, *part.shape), np.nan, part.dtype), shapes)
