@@ -181,6 +181,9 @@ class ModelConfig:
     relaxation_momentum: float = 0.0
     """Share of the last step that such a step goes on with (heavy ball, Polyak 1964); its own part is longer by the
     same share. Then as many steps reach farther."""
+    shown_relaxation: int = 0
+    """Steps that relax the garment where it is shown and another mesh feels, with a momentum of 0.8. They take out
+    stretch that the code leaves, and no training knows of them. 0: as `relaxation`. Only with `felt`."""
     felt: str = ""
     """The same garment with fewer vertices, by asset name or path. It feels the forces in place of the garment itself,
     and is its level of detail. Empty: the garment itself. Only with `stage2.forces`."""
@@ -203,6 +206,9 @@ class ModelConfig:
         momentum = self.relaxation_momentum
         _require(0 <= momentum < 1, f"relaxation_momentum must be at least 0 and below 1, got {momentum}")
         _require(momentum == 0 or self.relaxation > 0, "relaxation_momentum needs relaxation > 0")
+        steps = self.shown_relaxation
+        _require(0 <= steps <= 64, f"shown_relaxation must be 0 to 64, got {steps}")
+        _require(steps == 0 or (self.relaxation > 0 and self.felt != ""), "shown_relaxation needs relaxation > 0 and felt")
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
         _require(len(self.convolution) > 0, "the convolution needs a block")
         _require(

@@ -455,7 +455,8 @@ def random_force_psi(skip=True, limit=5.0, relaxation=0, scaled=0.0, gated=False
     )
     if meshes:
         garment, felt = meshes
-        config = dataclasses.replace(config, garment=garment, model=dataclasses.replace(config.model, felt=felt))
+        model = dataclasses.replace(config.model, felt=felt, shown_relaxation=5 if relaxation and felt else 0)
+        config = dataclasses.replace(config, garment=garment, model=model)
     experiment = assembly.assemble(config)
     scene, size, rng = experiment.scene, 40, np.random.default_rng(0)
     basis = 0.05 * laplacian_shapes.laplacian(scene, config)

@@ -124,15 +124,13 @@ def shown_outside(
         return point, normal, g("Min", farthest, np.float32(model.config.physics.collision_offset))
 
     if felt is not None and felt.mesh is not None:
-        steps = drape.relaxation_steps(model)
-        momentum = model.config.model.relaxation_momentum
         outside = g.skinned(garment, transforms, model.network.weights)
-        outside = _relaxed(g, model, outside, steps, momentum, alone=True)
+        outside = _relaxed(g, model, outside, *drape.shown_relaxation(model), alone=True)
         sides = np.concatenate([np.asarray(felt.mesh.faces, np.int64)[:, [i, (i + 1) % 3]] for i in range(3)])
         sides = np.unique(np.sort(sides, axis=1), axis=0)
         planes = _nearest_beside(g, g("Add", outside, advance), touched, felt)
         of_shown = targets(outside, onnx_forces.raised(g, planes, outside, sides, len(felt.around), drape.RAISED))
-        for _ in range(steps):
+        for _ in range(drape.relaxation_steps(model)):
             outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, 0.0, alone=True)
         return _pushed_out(g, outside, *of_shown)
     of_vertices = targets(outside, touched.vertices)
@@ -193,8 +191,7 @@ def shown_apart(g: Graph, model: Model, garment: str, hung: Hung, transforms: st
         rows = onnx_forces.blended(g, transforms, np.asarray(model.network.weights))
         decoded = g.reshape(garment, 3, len(felt.around))
         skinned = onnx_forces.moved(g, rows, decoded)
-        momentum = model.config.model.relaxation_momentum
-        placed = _relaxed(g, model, skinned, drape.relaxation_steps(model), momentum, alone=True)
+        placed = _relaxed(g, model, skinned, *drape.shown_relaxation(model), alone=True)
         back = _unapplied(g, rows, g("Sub", placed, skinned))
         return g.reshape(g("Add", decoded, back), 3 * len(felt.around))
     moved = g("Sub", hung.canonical, g.reshape(hung.decoded, 3, len(it.cloth.mass)))

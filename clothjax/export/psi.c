@@ -9,13 +9,13 @@
 #include <string.h>
 
 #define PLAIN 1           /* version of a file without forces; ... */
-#define FORCED 8          /* ... and with them */
+#define FORCED 9          /* ... and with them */
 #define ALIGN 64          /* bytes, of all arrays */
 #define FARTHEST 1e6f     /* m from the origin */
 #define MOST_JOINTS 1024
 #define MOST_WIDTH 65536  /* inputs of a layer: their sums have room in 32 bits */
 #define MOST_HIDDEN 16
-#define MOST_STEPS 16
+#define MOST_STEPS 64
 #define MOST_ELEMENTS (1 << 20)
 #define LANES 64          /* vertices that are skinned at once */
 #define LEAST 1e-30f      /* inputs of a layer that are smaller than this are nothing */
@@ -52,15 +52,16 @@ typedef struct { /* a garment whose stretching is known; rows end at multiples o
     const int32_t *corner;           /* [3][triangles] */
     const float *inverse, *mu, *lam; /* [4][triangles]; 2 mu and lam times area and thickness */
     const float *mobility;           /* [vertices] m/N, in a step of relaxation */
+    int32_t steps;                   /* of relaxation, and ... */
+    float momentum;                  /* ... theirs */
 } fabric;
 
 typedef struct { /* what a predictor with forces knows of the cloth and of the body; rows end at multiples of LANES */
-    int32_t vertices, hinges, body, faces, clusters, edges, edge_clusters, relaxation;
+    int32_t vertices, hinges, body, faces, clusters, edges, edge_clusters;
     fabric felt, shown;                               /* the latter, if it is relaxed by itself, has triangles */
     float timestep, gravity;
     float stiffness, offset;                          /* N/m and m, of planes that are touched; ... */
     float highest, deepest, reach;                    /* ... m, raised, pushed, and far from an edge at most */
-    float momentum;                                   /* of relaxation */
     const float *mass;                                /* [vertices] */
     const int32_t *hinge;                             /* [4][hinges] */
     const float *bend, *angle;                        /* [hinges] */
@@ -248,20 +249,21 @@ static exact read_exact(reader *r, psi_model *m) {
     return e;
 }
 
-static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int relaxed) {
-    fabric c = {vertices, triangles, NULL, NULL, NULL, NULL, NULL};
+static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int32_t steps, float momentum) {
+    fabric c = {vertices, triangles, NULL, NULL, NULL, NULL, NULL, steps, momentum};
+    if (!(momentum >= 0.0f && momentum < 1.0f)) r->sound = 0;
     c.corner = indices(r, 3 * padded(triangles), vertices);
     c.inverse = floats(r, 4 * (size_t)padded(triangles));
     c.mu = floats(r, padded(triangles));
     c.lam = floats(r, padded(triangles));
-    if (relaxed) c.mobility = floats(r, padded(vertices));
+    if (steps) c.mobility = floats(r, padded(vertices));
     return c;
 }
 
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
-    const int32_t *head = integers(r, 11);
-    const float *rates = floats(r, 8);
+    const int32_t *head = integers(r, 12);
+    const float *rates = floats(r, 9);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
     const int32_t triangles = within(r, head[1], 0, MOST_ELEMENTS), shown = within(r, head[10], 0, MOST_ELEMENTS);
@@ -273,12 +275,10 @@ static void read_forces(reader *r, psi_model *m) {
     m->apart = head[6];
     f->edges = within(r, head[7], 0, MOST_ELEMENTS);
     f->edge_clusters = within(r, head[8], 0, MOST_ELEMENTS / NEIGHBOURS);
-    f->relaxation = within(r, head[9], 0, MOST_STEPS);
     f->timestep = rates[0], f->gravity = rates[1], f->stiffness = rates[2], f->offset = rates[3];
-    f->highest = rates[4], f->deepest = rates[5], f->reach = rates[6], f->momentum = rates[7];
-    if (!(f->momentum >= 0.0f && f->momentum < 1.0f)) r->sound = 0;
+    f->highest = rates[4], f->deepest = rates[5], f->reach = rates[6];
     f->mass = floats(r, padded(f->vertices));
-    f->felt = read_fabric(r, f->vertices, triangles, f->relaxation > 0);
+    f->felt = read_fabric(r, f->vertices, triangles, within(r, head[9], 0, MOST_STEPS), rates[7]);
     f->hinge = indices(r, 4 * padded(f->hinges), f->vertices);
     f->bend = floats(r, padded(f->hinges));
     f->angle = floats(r, padded(f->hinges));
@@ -292,7 +292,7 @@ static void read_forces(reader *r, psi_model *m) {
     if (m->apart) f->around = indices(r, 3 * padded(m->vertices), f->vertices);
     if (m->apart) f->share = floats(r, 3 * (size_t)padded(m->vertices));
     m->alone = m->apart && shown > 0;
-    if (m->alone) f->shown = read_fabric(r, m->vertices, shown, 1);
+    if (m->alone) f->shown = read_fabric(r, m->vertices, shown, within(r, head[11], 1, MOST_STEPS), rates[8]);
     f->besides = f->edge_clusters ? 6 : 3;
     if (m->alone) f->beside = indices(r, f->besides * padded(m->vertices), f->vertices + f->edges);
     f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
@@ -1174,9 +1174,9 @@ static void ease(const fabric *f, float momentum, float *x, float *last, float *
     }
 }
 
-static void ease_all(const forces *f, const fabric *of, float *x, float *last, float *push) {
+static void ease_all(const fabric *of, float *x, float *last, float *push) {
     memcpy(last, x, 3 * (size_t)padded(of->vertices) * sizeof(float));
-    for (int32_t n = 0; n < f->relaxation; n++) ease(of, f->momentum, x, last, push);
+    for (int32_t n = 0; n < of->steps; n++) ease(of, of->momentum, x, last, push);
 }
 
 /* Adds to `canonical` what s->held has moved by from `before`, carried back: skinning.unapply_direction. */
@@ -1205,7 +1205,7 @@ static void relax(const forces *f, psi_state *s) {
     const size_t wide = padded(f->vertices);
     float *before = s->force + 3 * wide, *canonical = s->force + 6 * wide;
     memcpy(before, s->held, 3 * wide * sizeof(float));
-    ease_all(f, &f->felt, s->held, s->eased, s->force);
+    ease_all(&f->felt, s->held, s->eased, s->force);
     carry_back(f, s, before, canonical);
     for (size_t i = 0; i < 3 * wide; i++) s->garment[i] += canonical[i];
 }
@@ -1218,7 +1218,7 @@ static void drape(const psi_model *m, psi_state *s) {
     for (int c = 0; c < 3; c++) memcpy(s->garment + c * wide, garment + c * count, count * sizeof(float));
     apply(s->blended, s->garment, still, wide, s->held);
     memset(s->force + 6 * wide, 0, 3 * wide * sizeof(float));
-    if (f->relaxation) relax(f, s);
+    if (f->felt.steps) relax(f, s);
     for (int c = 0; c < 3; c++) {
         const float advance = s->translation[c] - s->translation[3 + c];
         float *x = s->position + c * wide, *v = s->velocity + c * wide, *now = s->held + c * wide;
@@ -1292,7 +1292,7 @@ static void lift(const psi_model *m, psi_state *s) {
     find_targets(f, s->plane, s->held, wide, advance, s->target);
     if (f->edge_clusters) find_middles(f, s);
     if (f->edge_clusters) find_targets(f, s->plane_between, s->between, edges, advance, s->target_between);
-    for (int32_t n = 0; n < f->relaxation; n++) {
+    for (int32_t n = 0; n < f->felt.steps; n++) {
         push_held(f, s, advance);
         ease(&f->felt, 0.0f, s->held, s->eased, s->force);
     }
@@ -1389,13 +1389,13 @@ static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
     const size_t rows = padded(m->vertices);
     for (int32_t v = 0; v < m->vertices; v++)
         for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
-    ease_all(&m->f, &m->f.shown, s->shown, s->eased, s->moved);
+    ease_all(&m->f.shown, s->shown, s->eased, s->moved);
     find_planes_shown(m, s);
     raise_planes_shown(m, s);
     const float nowhere[3] = {0};
     for (size_t v = 0; v < rows; v++) s->aim[v] = m->f.offset;
     find_targets(&m->f, s->plane_shown, s->shown, rows, nowhere, s->aim);
-    for (int32_t n = 0; n < m->f.relaxation; n++) {
+    for (int32_t n = 0; n < m->f.felt.steps; n++) {
         push_shown(m, s);
         ease(&m->f.shown, 0.0f, s->shown, s->eased, s->moved);
     }

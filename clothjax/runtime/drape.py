@@ -23,6 +23,7 @@ AWAKE = 60  # frames that the cloth moves freely for on a body that stands still
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
 DEEPEST = 0.02  # m, by which a vertex or an edge is pushed out at most: what seems deeper is behind a plane's end
 REACH = 0.05  # m, farther from the middle of an edge a face, by its centroid, is not touched
+MOMENTUM = 0.8  # of `model.shown_relaxation`
 RAISED = 1.5  # heights of arcs, of planes that a garment touches which does not feel: relaxation draws its edges in
 
 
@@ -106,16 +107,15 @@ def _relaxed_outside(model: Model, garment: Array, touched: Touched, felt: Felt)
     """
     cloth = model.wearer.cloth
     assert cloth is not None and cloth.shown is not None and felt.mesh is not None
-    (rest, mobility), mesh, steps = cloth.shown, felt.mesh, relaxation_steps(model)
-    momentum = model.config.model.relaxation_momentum
-    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, steps, momentum)
+    (rest, mobility), mesh = cloth.shown, felt.mesh
+    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, *shown_relaxation(model))
     planes = _nearest_beside(garment, touched, felt)
     sides = jnp.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)])
     planes = forces.raised(planes._replace(point=planes.point_next), garment, sides, RAISED)
     point, normal = planes.point_next, planes.normal_next
     gap = contact_search.distance(garment, point, normal)
     apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
-    for _ in range(steps):
+    for _ in range(relaxation_steps(model)):
         garment = contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
         garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, 1, 0.0)
     return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
@@ -259,6 +259,15 @@ def relaxation_steps(model: Model) -> int:
     """Return how many steps relax the garment that feels."""
     assert model.wearer.cloth is not None
     return 0 if model.wearer.cloth.mobility is None else model.config.model.relaxation
+
+
+def shown_relaxation(model: Model) -> tuple[int, float]:
+    """Return how many steps relax a garment that is shown where another feels, before it is pushed out; and their
+    momentum."""
+    settings = model.config.model
+    if settings.shown_relaxation > 0:
+        return settings.shown_relaxation, MOMENTUM
+    return relaxation_steps(model), settings.relaxation_momentum
 
 
 def felt_garment(model: Model) -> tuple[Shown, Array]:

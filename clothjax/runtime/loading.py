@@ -290,6 +290,6 @@ def as_felt(config: Config, decoder: dict, garment: Garment, felt: Garment) -> t
     """
     on_garment, _ = on_each_other(felt, garment)
     shapes = jax.vmap(on_garment.interpolated)(_free(decoder["blendshapes"], garment))
-    model = dataclasses.replace(config.model, felt="")
+    model = dataclasses.replace(config.model, felt="", shown_relaxation=0)
     config = dataclasses.replace(config, garment=config.model.felt, model=model)
     return config, decoder | {"blendshapes": shapes}, rigged_like(felt, garment)

@@ -111,7 +111,7 @@ def test_it_is_the_animator_of_training(kind, motion, request):
 
 
 def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
-    """As in training, where nothing is touched."""
+    """In steps of its own, where nothing is touched; then as what is pushed out is."""
     model, experiment = coarse.model(), coarse.experiment
     config, scene = experiment.config, experiment.scene
     character = characters.dress(
@@ -119,10 +119,11 @@ def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
     )
     window = characters.window(scene, character, jax.tree.map(lambda x: x[0], rollouts.windows(motion)))
     code = 0.5 * jax.random.normal(jax.random.key(2), model.network.code_bounds.low.shape)
-    expected = phi.decode(coarse.garment, scene, character, code, window, config.model)
+    as_decoded = dataclasses.replace(config.model, relaxation=0, relaxation_momentum=0.0, shown_relaxation=0)
+    expected = phi.decode(coarse.garment, scene, character, code, window, as_decoded)
     mobility = relaxation.mobility(character.rest, character.material, scene.mesh, phi.free(scene.garment))
-    # as what is pushed out is relaxed too
-    expected = relaxation.relaxed(expected, mobility, character.rest, character.material, scene.mesh, 3, 0.0)
+    for steps in ((5, 0.8), (3, 0.0)):
+        expected = relaxation.relaxed(expected, mobility, character.rest, character.material, scene.mesh, *steps)
     rotations, joints = skinning.forward_kinematics(
         pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
     )
@@ -244,7 +245,7 @@ def test_a_part_of_what_is_relaxed_by_itself_differs_at_its_border_alone(coarse,
     whole, half = (inference.animate(each, motion) for each in (model, specialise.part(model, low)))
     assert np.abs(np.asarray(whole[0][-1] - whole[0][0])).max() > 0.01
     apart = np.linalg.norm(whole[0][:, low] - half[0], axis=-1)
-    assert np.quantile(apart, 0.6) < 1e-6 and 1e-4 < apart.max() < 0.02
+    assert np.quantile(apart, 0.5) < 1e-6 and 1e-4 < apart.max() < 0.02
     np.testing.assert_allclose(inference.animate(specialise.specialise(model), motion)[0], whole[0], atol=2e-5)
 
 
@@ -586,7 +587,7 @@ def test_what_is_relaxed_by_itself_is_shown_outside_of_what_is_touched(coarse, m
         _, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
         state, vertices = inference.step(model, state, pose(motion, t))
         cloth, garment = model.wearer.cloth, drape.shown(model, state.latent, transforms)
-        free = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 3, 0.5)
+        free = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 5, 0.8)
         point, normal = (jnp.asarray(x, jnp.float32) for x in planes_of(np.asarray(free), touched))
         apart = contact_search.distance(free, point, normal)
         target = jnp.minimum(offset, apart + drape.DEEPEST)
