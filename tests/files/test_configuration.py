@@ -80,6 +80,8 @@ def test_forces_need_a_moving_body_and_phis_descent(other, reason):
         ({"model": {"relaxation_momentum": 0.5}}, "relaxation_momentum needs relaxation > 0"),
         ({"model": {"relaxation_momentum": 1.0}}, r"relaxation_momentum must be at least 0 and below 1, got 1\.0"),
         ({"model": {"relaxation_momentum": -0.1}}, r"relaxation_momentum must be at least 0 and below 1, got -0\.1"),
+        ({"model": {"shown_relaxation": 65}}, "shown_relaxation must be 0 to 64, got 65"),
+        ({"model": {"shown_relaxation": 9, "relaxation": 4}}, "shown_relaxation needs relaxation > 0 and felt"),
     ],
 )
 def test_relaxation_needs_forces_and_few_steps(values, reason):
