@@ -208,7 +208,9 @@ class ModelConfig:
         _require(momentum == 0 or self.relaxation > 0, "relaxation_momentum needs relaxation > 0")
         steps = self.shown_relaxation
         _require(0 <= steps <= 64, f"shown_relaxation must be 0 to 64, got {steps}")
-        _require(steps == 0 or (self.relaxation > 0 and self.felt != ""), "shown_relaxation needs relaxation > 0 and felt")
+        _require(
+            steps == 0 or (self.relaxation > 0 and self.felt != ""), "shown_relaxation needs relaxation > 0 and felt"
+        )
         _require(self.mlp_layers >= 2, f"mlp_layers must be >= 2, got {self.mlp_layers}")
         _require(len(self.convolution) > 0, "the convolution needs a block")
         _require(

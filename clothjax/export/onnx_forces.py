@@ -1,4 +1,4 @@
-"""The forces on a garment in an ONNX graph, which a Psi with forces feels: as `forces.on_vertices` and `forces.felt_planes`.
+"""The forces on a garment in an ONNX graph, which Psi feels: as `forces.on_vertices` and `forces.felt_planes`.
 
 A row of vectors is [N, 3, n], of scalars [N, 1, n], for N characters.
 """

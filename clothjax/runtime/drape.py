@@ -23,7 +23,7 @@ AWAKE = 60  # frames that the cloth moves freely for on a body that stands still
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
 DEEPEST = 0.02  # m, by which a vertex or an edge is pushed out at most: what seems deeper is behind a plane's end
 REACH = 0.05  # m, farther from the middle of an edge a face, by its centroid, is not touched
-MOMENTUM = 0.8  # of `model.shown_relaxation`
+SHOWN_MOMENTUM = 0.8  # of `model.shown_relaxation`
 RAISED = 1.5  # heights of arcs, of planes that a garment touches which does not feel: relaxation draws its edges in
 
 
@@ -266,7 +266,7 @@ def shown_relaxation(model: Model) -> tuple[int, float]:
     momentum."""
     settings = model.config.model
     if settings.shown_relaxation > 0:
-        return settings.shown_relaxation, MOMENTUM
+        return settings.shown_relaxation, SHOWN_MOMENTUM
     return relaxation_steps(model), settings.relaxation_momentum
 
 
