@@ -206,8 +206,8 @@ def viewer():
 def test_faces_of_pinned_vertices_are_shown_beside_psi_too(monkeypatch):
     load = storage.load_garment
 
-    def pinned_above(name, body):
-        garment = load(name, body)
+    def pinned_above(name, body, joint_names=None):
+        garment = load(name, body, joint_names)
         height = np.asarray(garment.vertices)[:, 1]
         return garment._replace(pinned=height > np.median(height))
 
