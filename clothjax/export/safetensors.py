@@ -98,7 +98,8 @@ def from_safetensors(path: str | Path) -> Model:
             felt = None
             if f"{own}.felt.shapes" in arrays:
                 alone = fields(Mesh, f"{own}.felt.mesh") if f"{own}.felt.mesh.faces" in arrays else None
-                felt = fields(Felt, f"{own}.felt", mesh=alone, beside=arrays.get(f"{own}.felt.beside"))
+                beside = None if alone is None else arrays[f"{own}.felt.beside"]
+                felt = fields(Felt, f"{own}.felt", mesh=alone, beside=beside)
             whitening = fields(Whitening, f"{own}.scales.whitening")
             scales = fields(ForceScales, f"{own}.scales", whitening=whitening)
             parts = {name: fields(of, f"{own}.{name}") for name, of in (("mesh", Mesh), ("clusters", Clusters))}

@@ -152,9 +152,10 @@ def unfinished(run: str | Path) -> str:
     Raises:
         ValueError: if there is no readable configuration.
     """
+    if packed(run):
+        return ""
     config = configured(run)
-    stages = ("stage1",) if config.peer.network else STAGES
-    for stage in () if packed(run) else stages:
+    for stage in ("stage1",) if config.peer.network else STAGES:
         forces = stage == "stage2" and config.stage2.forces
         wanted = config.labels.all_steps if forces else getattr(config, stage).steps
         done = max(checkpoint.steps(Path(run) / stage / "checkpoints"), default=0)

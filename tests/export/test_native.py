@@ -348,6 +348,19 @@ def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path)
             native.Psi(library, path, *map(np.asarray, at(motion, 0)))
 
 
+def test_a_file_whose_shown_garment_is_relaxed_in_no_steps_is_refused(library, forced, motion, tmp_path, monkeypatch):
+    """It would have no mobility, which is needed as it is pushed out."""
+    model, path = forced["coarse"], tmp_path / "g.psi"
+    wearer, shown = model.wearer, model.wearer.cloth.shown
+    for steps, mobility in ((0, None), (65, shown.mobility)):
+        wearer = wearer._replace(cloth=wearer.cloth._replace(shown=shown._replace(mobility=mobility)))
+        with monkeypatch.context() as patch:
+            patch.setattr(drape, "shown_relaxation", lambda _, steps=steps: (steps, 0.5))
+            path.write_bytes(native.as_bytes(native._arrays(dataclasses.replace(model, wearer=wearer))))
+        with pytest.raises(ValueError, match=r"g\.psi: a damaged \.psi"):
+            native.Psi(library, path, *map(np.asarray, at(motion, 0)))
+
+
 def test_more_vertices_than_plain_c_takes_are_refused(forced, monkeypatch):
     monkeypatch.setattr(native, "MOST_WIDTH", 3000)
     with pytest.raises(ValueError, match=r"plain C takes 1000 vertices of a garment with forces, not 1016"):

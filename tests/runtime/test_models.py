@@ -1,6 +1,7 @@
 """The garments that come with the library."""
 
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +60,17 @@ def test_a_shipped_garment_moves_like_cloth_on_a_body_that_walks(name):
     length, rest = (np.linalg.norm(x[..., edges[:, 0], :] - x[..., edges[:, 1], :], axis=-1)
                     for x in (vertices, np.asarray(template)))  # fmt: skip
     assert np.percentile(np.abs(length / rest - 1), 95) < 0.15
+
+
+def test_a_garment_of_another_skeleton_is_not_loaded(tmp_path):
+    body, names = storage.load_rig("body")
+    about = {"name": "g", "body": "body", "source": "test", "licence": "CC0-1.0"}
+    storage.save_garment(tmp_path / "g.h5", storage.load_garment("tshirt_1000", body), names[::-1], **about)
+    folder = shutil.copytree(trained.find("tshirt_pose"), tmp_path / "model")
+    settings = (folder / trained.CONFIG).read_text()
+    (folder / trained.CONFIG).write_text(settings.replace("tshirt_1000", str(tmp_path / "g.h5")))
+    with pytest.raises(ValueError, match=r"g\.h5.*the garment has another order"):
+        cj.load(folder)
 
 
 def test_a_garment_is_in_float32_in_a_process_that_is_not():
