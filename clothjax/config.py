@@ -182,8 +182,9 @@ class ModelConfig:
     """Share of the last step that such a step goes on with (heavy ball, Polyak 1964); its own part is longer by the
     same share. Then as many steps reach farther."""
     shown_relaxation: int = 0
-    """Steps that relax the garment where it is shown and another mesh feels, with a momentum of 0.8. They take out
-    stretch that the code leaves, and no training knows of them. 0: as `relaxation`. Only with `felt`."""
+    """Steps that relax the garment where it is shown and another mesh feels, with a momentum of 0.8. Twice six steps
+    with one of 0.5 follow, in turn with being pushed out of the body. They take out stretch that the code leaves, and
+    no training knows of them. 0: as `relaxation`, and as many in turn. Only with `felt`."""
     felt: str = ""
     """The same garment with fewer vertices, by asset name or path. It feels the forces in place of the garment itself,
     and is its level of detail. Empty: the garment itself. Only with `stage2.forces`."""

@@ -26,7 +26,7 @@ from clothjax.types import Array, Material, Mesh, Motion, Rest
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("psi.h", "psi.c"))
 MAGIC = int.from_bytes(b"PSI\0", "little")
 VERSION = 1  # of a model without forces; ...
-FORCED = 9  # ... and of one with forces
+FORCED = 10  # ... and of one with forces
 ALIGN = 64
 MOST_WIDTH = 65536  # inputs of a layer
 LANES = 64  # vertices skinned at once
@@ -117,18 +117,18 @@ def _of_forces(model: Model, predictor: ForcePredictor) -> Iterator[np.ndarray]:
     between = np.zeros((0, ASKED), np.int32)
     if len(edges) > 0:
         between = even(halved(np.asarray(middles(template.T, edges)), np.arange(len(edges)), ASKED), ASKED)
-    steps, momentum = drape.shown_relaxation(model)
+    how = drape.shown_relaxation(model)
     yield np.array(
         [len(cloth.mass), len(mesh.faces), len(mesh.hinges), len(cloth.body), len(faces), len(near),
          predictor.felt is not None, len(edges), len(between), drape.relaxation_steps(model),
-         0 if alone is None else len(alone.faces), steps],
+         0 if alone is None else len(alone.faces), how.steps, how.rounds, how.turns],
         np.int32,
     )  # fmt: skip
     weight = 0.0 if "gravity" in physics.without else GRAVITY
     spring = 3.0 * forces.DEPTH * physics.collision_stiffness  # N/m
     yield np.array(
         [1 / model.config.fps, weight, spring, physics.collision_offset, forces.HIGHEST, drape.DEEPEST, drape.REACH,
-         model.config.model.relaxation_momentum, momentum],
+         model.config.model.relaxation_momentum, how.momentum, how.outside_momentum],
         np.float32,
     )  # fmt: skip
     stiffness = 0.0 if "bending" in physics.without else np.asarray(cloth.material.bending)

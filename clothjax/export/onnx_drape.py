@@ -3,6 +3,8 @@
 It follows `clothjax/runtime/drape.py`. A row of vectors is [N, 3, n], of scalars [N, 1, n], for N characters.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -125,14 +127,16 @@ def shown_outside(
 
     if felt is not None and felt.mesh is not None:
         outside = g.skinned(garment, transforms, model.network.weights)
-        outside = _relaxed(g, model, outside, *drape.shown_relaxation(model), alone=True)
+        how = drape.shown_relaxation(model)
+        outside = _relaxed(g, model, outside, how.steps, how.momentum, alone=True)
         sides = np.concatenate([np.asarray(felt.mesh.faces, np.int64)[:, [i, (i + 1) % 3]] for i in range(3)])
         sides = np.unique(np.sort(sides, axis=1), axis=0)
-        planes = _nearest_beside(g, g("Add", outside, advance), touched, felt)
-        of_shown = targets(outside, onnx_forces.raised(g, planes, outside, sides, len(felt.around), drape.RAISED))
-        for _ in range(drape.relaxation_steps(model)):
-            outside = _relaxed(g, model, _pushed_out(g, outside, *of_shown), 1, 0.0, alone=True)
-        return _pushed_out(g, outside, *of_shown)
+        for _ in range(how.rounds):
+            planes = _nearest_beside(g, g("Add", outside, advance), touched, felt)
+            of_shown = targets(outside, onnx_forces.raised(g, planes, outside, sides, len(felt.around), drape.RAISED))
+            pushed = partial(_pushed_out, g, point=of_shown[0], normal=of_shown[1], apart=of_shown[2])
+            outside = pushed(_relaxed(g, model, outside, how.turns, how.outside_momentum, pushed, alone=True))
+        return outside
     of_vertices = targets(outside, touched.vertices)
     of_edges = None
     if touched.edges is not None:
@@ -144,9 +148,7 @@ def shown_outside(
             garment = _edges_pushed_out(g, model, garment, edges, *of_edges)
         return _pushed_out(g, garment, *of_vertices)
 
-    for _ in range(drape.relaxation_steps(model)):
-        outside = _relaxed(g, model, pushed_out(outside), 1, 0.0)
-    outside = pushed_out(outside)
+    outside = pushed_out(_relaxed(g, model, outside, drape.relaxation_steps(model), 0.0, pushed_out))
     if felt is None:
         return outside
     back = _unapplied(g, rows, g("Sub", outside, hung.placed))
@@ -191,7 +193,8 @@ def shown_apart(g: Graph, model: Model, garment: str, hung: Hung, transforms: st
         rows = onnx_forces.blended(g, transforms, np.asarray(model.network.weights))
         decoded = g.reshape(garment, 3, len(felt.around))
         skinned = onnx_forces.moved(g, rows, decoded)
-        placed = _relaxed(g, model, skinned, *drape.shown_relaxation(model), alone=True)
+        how = drape.shown_relaxation(model)
+        placed = _relaxed(g, model, skinned, how.steps, how.momentum, alone=True)
         back = _unapplied(g, rows, g("Sub", placed, skinned))
         return g.reshape(g("Add", decoded, back), 3 * len(felt.around))
     moved = g("Sub", hung.canonical, g.reshape(hung.decoded, 3, len(it.cloth.mass)))
@@ -229,10 +232,19 @@ def _middles(g: Graph, positions: str, edges: np.ndarray) -> str:
     return g("Mul", g("Add", start, end), np.float32(0.5))
 
 
-def _relaxed(g: Graph, model: Model, position: str, steps: int, momentum: float, alone: bool = False) -> str:
+def _relaxed(
+    g: Graph,
+    model: Model,
+    position: str,
+    steps: int,
+    momentum: float,
+    placed: Callable[[str], str] | None = None,
+    alone: bool = False,
+) -> str:
     """Return positions [N, 3, V] m after some of the steps of `relaxation.relaxed`.
 
     Args:
+        placed: as there.
         alone: they are of the garment of `Felt.mesh`, not of the one that feels.
     """
     it = onnx_forces.parts(model)
@@ -243,6 +255,7 @@ def _relaxed(g: Graph, model: Model, position: str, steps: int, momentum: float,
     faces, mobility, longest = np.asarray(mesh.faces), np.asarray(mobility), np.float32(relaxation.LONGEST**-2)
     before, share = position, np.float32(momentum)
     for _ in range(steps):
+        position = position if placed is None else placed(position)
         gradients = onnx_forces.stretching(g, rest, it.cloth.material, position, faces)
         pull = onnx_forces.at_vertices(g, gradients, [faces], len(mobility))
         move = g("Mul", pull, -(1 + share) * mobility)

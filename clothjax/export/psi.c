@@ -9,7 +9,7 @@
 #include <string.h>
 
 #define PLAIN 1           /* version of a file without forces; ... */
-#define FORCED 9          /* ... and with them */
+#define FORCED 10         /* ... and with them */
 #define ALIGN 64          /* bytes, of all arrays */
 #define FARTHEST 1e6f     /* m from the origin */
 #define MOST_JOINTS 1024
@@ -73,6 +73,8 @@ typedef struct { /* what a predictor with forces knows of the cloth and of the b
     const float *share;                               /* [3] ... how much of their relaxation it takes */
     const int32_t *beside;  /* [besides][...] what touches the planes it may touch: those that feel, then their edges */
     int32_t besides;
+    int32_t rounds, turns;  /* in which what is shown is pushed out of those planes and relaxed, by turns, and ... */
+    float turning;          /* ... the momentum of that */
     const float *middle, *inverse_spread;             /* of the inputs [(2 + KINDS) code], over BOUND */
     layer unshape, unmix, undecode[MOST_HIDDEN], first; /* transposed shapes, mix, layers of the decoder */
     layer read_fine;                                  /* the rest of the decoder's first, in sixteen bits */
@@ -249,9 +251,13 @@ static exact read_exact(reader *r, psi_model *m) {
     return e;
 }
 
-static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int32_t steps, float momentum) {
-    fabric c = {vertices, triangles, NULL, NULL, NULL, NULL, NULL, steps, momentum};
+static float fraction(reader *r, float momentum) {
     if (!(momentum >= 0.0f && momentum < 1.0f)) r->sound = 0;
+    return momentum;
+}
+
+static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int32_t steps, float momentum) {
+    fabric c = {vertices, triangles, NULL, NULL, NULL, NULL, NULL, steps, fraction(r, momentum)};
     c.corner = indices(r, 3 * padded(triangles), vertices);
     c.inverse = floats(r, 4 * (size_t)padded(triangles));
     c.mu = floats(r, padded(triangles));
@@ -262,8 +268,8 @@ static fabric read_fabric(reader *r, int32_t vertices, int32_t triangles, int32_
 
 static void read_forces(reader *r, psi_model *m) {
     forces *f = &m->f;
-    const int32_t *head = integers(r, 12);
-    const float *rates = floats(r, 9);
+    const int32_t *head = integers(r, 14);
+    const float *rates = floats(r, 10);
     if (!r->sound) return;
     f->vertices = within(r, head[0], 1, MOST_ELEMENTS);
     const int32_t triangles = within(r, head[1], 0, MOST_ELEMENTS), shown = within(r, head[10], 0, MOST_ELEMENTS);
@@ -293,6 +299,8 @@ static void read_forces(reader *r, psi_model *m) {
     if (m->apart) f->share = floats(r, 3 * (size_t)padded(m->vertices));
     m->alone = m->apart && shown > 0;
     if (m->alone) f->shown = read_fabric(r, m->vertices, shown, within(r, head[11], 1, MOST_STEPS), rates[8]);
+    f->rounds = within(r, head[12], 1, MOST_STEPS), f->turns = within(r, head[13], 0, MOST_STEPS);
+    f->turning = fraction(r, rates[9]);
     f->besides = f->edge_clusters ? 6 : 3;
     if (m->alone) f->beside = indices(r, f->besides * padded(m->vertices), f->vertices + f->edges);
     f->middle = floats(r, (2 + KINDS) * (size_t)m->code);
@@ -1390,16 +1398,19 @@ static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
     for (int32_t v = 0; v < m->vertices; v++)
         for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
     ease_all(&m->f.shown, s->shown, s->eased, s->moved);
-    find_planes_shown(m, s);
-    raise_planes_shown(m, s);
     const float nowhere[3] = {0};
-    for (size_t v = 0; v < rows; v++) s->aim[v] = m->f.offset;
-    find_targets(&m->f, s->plane_shown, s->shown, rows, nowhere, s->aim);
-    for (int32_t n = 0; n < m->f.felt.steps; n++) {
+    for (int32_t round = 0; round < m->f.rounds; round++) {
+        find_planes_shown(m, s);
+        raise_planes_shown(m, s);
+        for (size_t v = 0; v < rows; v++) s->aim[v] = m->f.offset;
+        find_targets(&m->f, s->plane_shown, s->shown, rows, nowhere, s->aim);
+        memcpy(s->eased, s->shown, 3 * rows * sizeof(float));
+        for (int32_t n = 0; n < m->f.turns; n++) {
+            push_shown(m, s);
+            ease(&m->f.shown, m->f.turning, s->shown, s->eased, s->moved);
+        }
         push_shown(m, s);
-        ease(&m->f.shown, 0.0f, s->shown, s->eased, s->moved);
     }
-    push_shown(m, s);
     for (int32_t v = 0; v < m->vertices; v++)
         for (int c = 0; c < 3; c++) vertices[3 * v + c] = s->shown[c * rows + v] + last[c];
 }

@@ -5,6 +5,7 @@ displacements in the plane that go with the fold. These steps find them. They re
 the code's.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -83,19 +84,24 @@ def relaxed(
     mesh: Mesh,
     steps: int,
     momentum: float,
+    placed: Callable[[Array], Array] | None = None,
 ) -> Float[Array, "V 3"]:
     """Return positions [V, 3] m after some steps down the stretching energy.
 
     Args:
         mobility: [V] m/N, of `mobility`; a step is longer than that by `momentum`.
         momentum: share of the last step that each goes on with. Its limit of stability rises as its length does.
+        placed: moves positions [V, 3] m before each step, such as out of a body.
     """
-    if steps > 0 and kernels.used(position):
+    if steps == 0:
+        return position
+    if placed is None and kernels.used(position):
         return kernels.relaxed(position, mobility, rest, material, mesh, steps, momentum, LONGEST)
     elastic = Elastic(rest.inverse, rest.face_area, material.mu, material.lam)
 
     def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         position, before = carry
+        position = position if placed is None else placed(position)
         move = -(1.0 + momentum) * mobility[:, None] * stretching_gradient(position, mesh.faces, elastic)
         length = jnp.sum(move * move, axis=-1, keepdims=True)
         move = move / jnp.sqrt(1.0 + length / LONGEST**2)

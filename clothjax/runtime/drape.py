@@ -3,6 +3,7 @@
 Garments are [3, V], coordinate by coordinate, because processors are fast at long rows.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -23,8 +24,19 @@ AWAKE = 60  # frames that the cloth moves freely for on a body that stands still
 SLOWING = 0.95  # ... in each frame the change of the code shrinks by this
 DEEPEST = 0.02  # m, by which a vertex or an edge is pushed out at most: what seems deeper is behind a plane's end
 REACH = 0.05  # m, farther from the middle of an edge a face, by its centroid, is not touched
-SHOWN_MOMENTUM = 0.8  # of `model.shown_relaxation`
+SHOWN_MOMENTUM, OUTSIDE_MOMENTUM = 0.8, 0.5  # of `model.shown_relaxation`: of its steps, then of ...
+ROUNDS, TURNS = 2, 6  # ... its rounds, and their turns
 RAISED = 1.5  # heights of arcs, of planes that a garment touches which does not feel: relaxation draws its edges in
+
+
+class ShownRelaxation(NamedTuple):
+    """How a garment is relaxed that is shown where another feels: in steps, then in rounds outside the body."""
+
+    steps: int
+    momentum: float  # of the steps
+    rounds: int  # each with the planes that are nearest as it begins
+    turns: int  # of a round: pushed out of the planes, then a step
+    outside_momentum: float  # of the turns
 
 
 class Touched(NamedTuple):
@@ -86,9 +98,7 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
         garment = contact_search.edges_pushed_out(garment, edges, *of_edges, DEEPEST)
         return contact_search.pushed_out(garment, *of_vertices, DEEPEST)
 
-    for _ in range(relaxation_steps(model)):
-        outside = _relaxed(model, pushed_out(outside), 1, 0.0)
-    outside = pushed_out(outside)
+    outside = pushed_out(_relaxed(model, outside, relaxation_steps(model), 0.0, pushed_out))
     if parts.felt is None:
         return outside
     back = skinning.unapply_direction(_matrices(model, transforms), outside - drape.position)
@@ -101,24 +111,33 @@ def shown_outside(model: Model, latent: Array, drape: Drape, touched: Touched, t
 def _relaxed_outside(model: Model, garment: Array, touched: Touched, felt: Felt) -> Array:
     """Return the garment [V, 3] m that does not feel, relaxed, then pushed out and relaxed in turn.
 
+    Where it is near tells what it touches. That changes as it is pushed and relaxed, so it is asked anew.
+
     Args:
         garment: before that.
         touched: by the garment that feels.
     """
-    cloth = model.wearer.cloth
+    cloth, how = model.wearer.cloth, shown_relaxation(model)
     assert cloth is not None and cloth.shown is not None and felt.mesh is not None
     (rest, mobility), mesh = cloth.shown, felt.mesh
-    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, *shown_relaxation(model))
-    planes = _nearest_beside(garment, touched, felt)
     sides = jnp.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)])
-    planes = forces.raised(planes._replace(point=planes.point_next), garment, sides, RAISED)
-    point, normal = planes.point_next, planes.normal_next
-    gap = contact_search.distance(garment, point, normal)
-    apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
-    for _ in range(relaxation_steps(model)):
-        garment = contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
-        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, 1, 0.0)
-    return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
+    garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, how.steps, how.momentum)
+
+    def lifted(garment: Array, _: None) -> tuple[Array, None]:
+        planes = _nearest_beside(garment, touched, felt)
+        planes = forces.raised(planes._replace(point=planes.point_next), garment, sides, RAISED)
+        point, normal = planes.point_next, planes.normal_next
+        gap = contact_search.distance(garment, point, normal)
+        apart = jnp.minimum(model.config.physics.collision_offset, gap + DEEPEST)
+
+        def pushed_out(garment: Array) -> Array:
+            return contact_search.pushed_out(garment, point, normal, apart, DEEPEST)
+
+        turns = how.turns, how.outside_momentum
+        garment = relaxation.relaxed(garment, mobility, rest, cloth.material, mesh, *turns, pushed_out)
+        return pushed_out(garment), None
+
+    return jax.lax.scan(lifted, garment, None, length=how.rounds)[0]
 
 
 def _nearest_beside(position: Array, touched: Touched, felt: Felt) -> Contact:
@@ -237,12 +256,15 @@ def _hung(model: Model, latent: Array, transforms: Array) -> tuple[Array, Array]
     return garment + back.T, relaxed
 
 
-def _relaxed(model: Model, position: Array, steps: int, momentum: float) -> Array:
-    """Return the garment that feels [V, 3] m after some steps of relaxation."""
-    cloth = model.wearer.cloth
+def _relaxed(
+    model: Model, position: Array, steps: int, momentum: float, placed: Callable[[Array], Array] | None = None
+) -> Array:
+    """Return the garment that feels [V, 3] m after some steps of relaxation; arguments as of `relaxation.relaxed`."""
+    cloth, mesh = model.wearer.cloth, _forces(model).mesh
+    if steps == 0:
+        return position
     assert cloth is not None and cloth.mobility is not None
-    mesh = _forces(model).mesh
-    return relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, mesh, steps, momentum)
+    return relaxation.relaxed(position, cloth.mobility, cloth.rest, cloth.material, mesh, steps, momentum, placed)
 
 
 def _matrices(model: Model, transforms: Array) -> Array:
@@ -261,13 +283,12 @@ def relaxation_steps(model: Model) -> int:
     return 0 if model.wearer.cloth.mobility is None else model.config.model.relaxation
 
 
-def shown_relaxation(model: Model) -> tuple[int, float]:
-    """Return how many steps relax a garment that is shown where another feels, before it is pushed out; and their
-    momentum."""
+def shown_relaxation(model: Model) -> ShownRelaxation:
     settings = model.config.model
     if settings.shown_relaxation > 0:
-        return settings.shown_relaxation, SHOWN_MOMENTUM
-    return relaxation_steps(model), settings.relaxation_momentum
+        return ShownRelaxation(settings.shown_relaxation, SHOWN_MOMENTUM, ROUNDS, TURNS, OUTSIDE_MOMENTUM)
+    steps = relaxation_steps(model)
+    return ShownRelaxation(steps, settings.relaxation_momentum, 1, steps, 0.0)
 
 
 def felt_garment(model: Model) -> tuple[Shown, Array]:

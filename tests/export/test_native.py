@@ -214,7 +214,7 @@ def test_c_relaxes_what_is_relaxed_by_itself_before_it_is_pushed_too(forced, mot
     state, found = psi_ffi.step(psi_ffi.pack(model), state, at(motion, 1))
     given = (model, state.latent, state.drape, touched, transforms)
     whole, original = drape.shown_outside(*given), relaxation.relaxed
-    monkeypatch.setattr(relaxation, "relaxed", lambda x, *rest: x if rest[4] > 1 else original(x, *rest))
+    monkeypatch.setattr(relaxation, "relaxed", lambda x, *rest: original(x, *rest) if len(rest) > 6 else x)
     less = drape.shown_outside(*given)
     found -= at(motion, 1).translation[None]
     taken = jnp.sum((found - less) * (whole - less)) / jnp.sum((whole - less) ** 2)  # rounding goes another way
@@ -348,17 +348,29 @@ def test_damage_to_a_file_with_forces_is_told(library, forced, motion, tmp_path)
             native.Psi(library, path, *map(np.asarray, at(motion, 0)))
 
 
-def test_a_file_whose_shown_garment_is_relaxed_in_no_steps_is_refused(library, forced, motion, tmp_path, monkeypatch):
-    """It would have no mobility, which is needed as it is pushed out."""
+@pytest.mark.parametrize(
+    ("how", "mobile"),
+    [
+        ((0, 0.5, 2, 6, 0.5), False),  # it would have no mobility, which is needed as it is pushed out
+        ((65, 0.5, 2, 6, 0.5), True),
+        ((5, 1.0, 2, 6, 0.5), True),
+        ((5, 0.5, 0, 6, 0.5), True),
+        ((5, 0.5, 65, 6, 0.5), True),
+        ((5, 0.5, 2, 65, 0.5), True),
+        ((5, 0.5, 2, 6, np.nan), True),
+    ],
+)
+def test_a_file_whose_shown_garment_is_relaxed_in_impossible_steps_is_refused(
+    library, forced, motion, tmp_path, monkeypatch, how, mobile
+):
     model, path = forced["coarse"], tmp_path / "g.psi"
     wearer, shown = model.wearer, model.wearer.cloth.shown
-    for steps, mobility in ((0, None), (65, shown.mobility)):
-        wearer = wearer._replace(cloth=wearer.cloth._replace(shown=shown._replace(mobility=mobility)))
-        with monkeypatch.context() as patch:
-            patch.setattr(drape, "shown_relaxation", lambda _, steps=steps: (steps, 0.5))
-            path.write_bytes(native.as_bytes(native._arrays(dataclasses.replace(model, wearer=wearer))))
-        with pytest.raises(ValueError, match=r"g\.psi: a damaged \.psi"):
-            native.Psi(library, path, *map(np.asarray, at(motion, 0)))
+    if not mobile:
+        wearer = wearer._replace(cloth=wearer.cloth._replace(shown=shown._replace(mobility=None)))
+    monkeypatch.setattr(drape, "shown_relaxation", lambda _: drape.ShownRelaxation(*how))
+    path.write_bytes(native.as_bytes(native._arrays(dataclasses.replace(model, wearer=wearer))))
+    with pytest.raises(ValueError, match=r"g\.psi: a damaged \.psi"):
+        native.Psi(library, path, *map(np.asarray, at(motion, 0)))
 
 
 def test_more_vertices_than_plain_c_takes_are_refused(forced, monkeypatch):

@@ -111,7 +111,7 @@ def test_it_is_the_animator_of_training(kind, motion, request):
 
 
 def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
-    """In steps of its own, where nothing is touched; then as what is pushed out is."""
+    """In steps of its own, where nothing is touched; then in the two rounds of what is pushed out."""
     model, experiment = coarse.model(), coarse.experiment
     config, scene = experiment.config, experiment.scene
     character = characters.dress(
@@ -122,7 +122,7 @@ def test_what_is_shown_is_relaxed_on_its_own_mesh(coarse, motion):
     as_decoded = dataclasses.replace(config.model, relaxation=0, relaxation_momentum=0.0, shown_relaxation=0)
     expected = phi.decode(coarse.garment, scene, character, code, window, as_decoded)
     mobility = relaxation.mobility(character.rest, character.material, scene.mesh, phi.free(scene.garment))
-    for steps in ((5, 0.8), (3, 0.0)):
+    for steps in ((5, 0.8), (6, 0.5), (6, 0.5)):
         expected = relaxation.relaxed(expected, mobility, character.rest, character.material, scene.mesh, *steps)
     rotations, joints = skinning.forward_kinematics(
         pose(motion, 2).rotations, model.wearer.joints, np.array(model.parents)
@@ -245,7 +245,8 @@ def test_a_part_of_what_is_relaxed_by_itself_differs_at_its_border_alone(coarse,
     whole, half = (inference.animate(each, motion) for each in (model, specialise.part(model, low)))
     assert np.abs(np.asarray(whole[0][-1] - whole[0][0])).max() > 0.01
     apart = np.linalg.norm(whole[0][:, low] - half[0], axis=-1)
-    assert np.quantile(apart, 0.5) < 1e-6 and 1e-4 < apart.max() < 0.02
+    below = np.argsort(model.wearer.template[1, low])[:500]  # 17 steps reach 17 edges far, and ever less
+    assert apart[:, below].max() < 2e-4 and 1e-3 < apart.max() < 0.05
     np.testing.assert_allclose(inference.animate(specialise.specialise(model), motion)[0], whole[0], atol=2e-5)
 
 
@@ -551,9 +552,12 @@ def test_a_packed_one_is_loaded_with_its_coarse_mesh_and_as_it_alone(coarse, for
 
 
 def test_what_is_relaxed_by_itself_is_shown_outside_of_what_is_touched(coarse, motion):
-    """The planes are found here by loops: the nearest of six, raised by 1.5 of the height of arcs over edges."""
+    """In two rounds, each with planes that are found here by loops: the nearest of six, raised by 1.5 of the height of
+    arcs over edges."""
     model, offset = coarse.model(), coarse.experiment.config.physics.collision_offset
-    felt, pushed = model.network.predictor.felt, []
+    felt, pushed, anew = model.network.predictor.felt, [], []
+    fabric = model.wearer.cloth.shown.rest, model.wearer.cloth.material
+    elastic = relaxation.Elastic(fabric[0].inverse, fabric[0].face_area, fabric[1].mu, fabric[1].lam)
     number = {frozenset(edge): i for i, edge in enumerate(model.network.predictor.mesh.edges.tolist())}
     count = len(model.wearer.cloth.mass)
     beside = []
@@ -575,7 +579,7 @@ def test_what_is_relaxed_by_itself_is_shown_outside_of_what_is_touched(coarse, m
             arc = (normal[a] - normal[b]) @ (garment[a] - garment[b]) / 8
             height[[a, b]] = np.maximum(height[[a, b]], min(arc, forces.HIGHEST))
         assert height.max() > 1e-4
-        return points[chosen] + 1.5 * height[:, None] * normal, normal
+        return points[chosen] + 1.5 * height[:, None] * normal, normal, np.array(chosen)
 
     state = inference.initial_state(model, pose(motion, 0))
     for t in range(1, 4):
@@ -587,14 +591,32 @@ def test_what_is_relaxed_by_itself_is_shown_outside_of_what_is_touched(coarse, m
         _, touched = drape.predict(model, state.latent, state.drape, transforms, pose(motion, t), advance, None)
         state, vertices = inference.step(model, state, pose(motion, t))
         cloth, garment = model.wearer.cloth, drape.shown(model, state.latent, transforms)
-        free = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 5, 0.8)
-        point, normal = (jnp.asarray(x, jnp.float32) for x in planes_of(np.asarray(free), touched))
-        apart = contact_search.distance(free, point, normal)
-        target = jnp.minimum(offset, apart + drape.DEEPEST)
-        found = contact_search.distance(vertices - pose(motion, t).translation[None], point, normal)
-        assert jnp.all(found > target - 1e-5)
-        pushed.append(int(jnp.sum(apart < target - 1e-3)))
-    assert min(pushed) > 50
+        garment = relaxation.relaxed(garment, cloth.shown.mobility, cloth.shown.rest, cloth.material, felt.mesh, 5, 0.8)
+        changed = []
+        for _ in range(2):
+            point, normal, nearest = planes_of(np.asarray(garment), touched)
+            changed.append(nearest)
+            apart, deep = np.minimum(offset, np.sum((garment - point) * normal, axis=1) + drape.DEEPEST), []
+
+            def outside(x, point=point, normal=normal, apart=apart, deep=deep):
+                depth = np.clip(apart - np.sum((x - point) * normal, axis=1), 0.0, drape.DEEPEST)
+                deep.append(depth)
+                return x + depth[:, None] * normal
+
+            before = np.asarray(garment)
+            for _ in range(6):
+                now = outside(np.asarray(garment))
+                pull = relaxation.stretching_gradient(jnp.float32(now), felt.mesh.faces, elastic)
+                move = -1.5 * np.asarray(cloth.shown.mobility)[:, None] * pull
+                move /= np.sqrt(1 + np.sum(move**2, axis=1, keepdims=True) / relaxation.LONGEST**2)
+                garment, before = now + move + 0.5 * (now - before), now
+            garment = outside(garment)
+            pushed.append(np.sum(deep[0] > 1e-3))
+        anew.append(np.sum(changed[0] != changed[1]))
+        found = vertices - pose(motion, t).translation[None]
+        # beside a vertex between two planes it may be the other one
+        assert np.mean(np.linalg.norm(found - garment, axis=1) < 1e-5) > 0.98
+    assert min(pushed[::2]) > 50 and min(anew) > 20
 
 
 def test_a_packed_one_is_the_same_but_for_rounding(forced, motion, tmp_path):
