@@ -116,9 +116,11 @@ def _figures(report: dict) -> list[str]:
     for key, meaning in MEASURES.items():
         rows.append(f"| {meaning} | {' | '.join(_figure(report[method].get(key)) for method in methods)} |")
     names = ", ".join(f"`{name.removesuffix('.motion')}`" for name in report["motions"])
+    earlier = ", ".join(f"{METHODS[method]} at {commit}" for method, commit in report.get("commits", {}).items())
+    commit = report.get("commit", "unknown") + (f" ({earlier})" if earlier else "")
     return [
         "## How good it is",
-        f"Means over {names}, on a body that was not trained on, at commit {report.get('commit', 'unknown')}.",
+        f"Means over {names}, on a body that was not trained on, at commit {commit}.",
         "\n".join(rows),
     ]
 

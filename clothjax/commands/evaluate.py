@@ -4,6 +4,7 @@
     python -m clothjax evaluate runs/quickstart --motions walk_3 dance.motion.h5 --json report.json
     python -m clothjax evaluate skirt tshirt --motions walk_3
     python -m clothjax evaluate all --json report.json
+    python -m clothjax evaluate runs/quickstart --methods psi
 
 Three methods are measured: `lbs` (plain skinning), `phi` and `psi`, after all of its training. For a baseline's run
 they are `lbs` and its network, by name. No state is borrowed from the solver: every number is about the method's own
@@ -37,6 +38,9 @@ Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penet
 forces, pushed by accelerations of `PUSHES`, stand under `pushed`. Both are of at most 90 frames; a push that a shorter
 motion does not reach is left out.
 
+`--methods` measures some of them, such as a Psi that is loaded in another way now. The solver and the other methods
+are then not run again: their trajectories and measures are those of the last evaluation of the same networks.
+
 The report of one folder is written into it, as `evaluation.json`. For names, or several folders, it has the means over
 garments under `mean` and the report of each under its name. Validation motions that are not present are then left out:
 motion capture does not come with the library. METHOD.md has the formulas of the measures, under Measures.
@@ -46,7 +50,7 @@ import json
 from pathlib import Path
 
 from clothjax import cli
-from clothjax.evaluation.report import evaluate, evaluate_packed, table
+from clothjax.evaluation.report import EVALUATION, evaluate, evaluate_packed, table
 from clothjax.runtime import trained
 
 
@@ -61,6 +65,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--motions", nargs="+", default=None, help="asset names or paths; default: the configured ones")
     parser.add_argument("--json", type=Path, default=None, help="default: evaluation.json, in the folder of one run")
     parser.add_argument("--jobs", type=int, default=1, help="processes that measure at once")
+    parser.add_argument("--methods", nargs="+", default=None, help="to measure; default: all")
     arguments = parser.parse_args(argv)
     names = trained.shipped() if arguments.model == ["all"] else arguments.model
     folders = {Path(name).resolve().name: trained.find(name) for name in names}
@@ -68,14 +73,14 @@ def main(argv: list[str]) -> None:
         raise ValueError(f"two models have one name: {', '.join(names)}; measure them one after the other")
     first = next(iter(folders.values()), Path("."))
     alone = len(names) == 1 and names[0] not in trained.shipped()
-    path = arguments.json or (first if alone else Path(".")) / "evaluation.json"
+    path = arguments.json or (first if alone else Path(".")) / EVALUATION
     if arguments.json is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
     if alone:
-        report = evaluate(first, arguments.motions, jobs=arguments.jobs)
+        report = evaluate(first, arguments.motions, jobs=arguments.jobs, methods=arguments.methods)
         print(table(report["evaluation"]))
     else:
-        report = evaluate_packed(folders, arguments.motions, arguments.jobs)
+        report = evaluate_packed(folders, arguments.motions, arguments.jobs, arguments.methods)
         print(table(report["mean"]))
     path.write_text(json.dumps(report, indent=1) + "\n")
     print(f"written to {path}")

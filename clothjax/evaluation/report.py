@@ -1,7 +1,8 @@
 """The measures of a run as one nested dictionary, and as Markdown."""
 
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from clothjax.evaluation.rollouts import (
     skinned_trajectory,
     windows,
 )
-from clothjax.files import configuration
+from clothjax.files import configuration, damage
 from clothjax.material import configured_material
 from clothjax.networks import animators
 from clothjax.networks.psi import input_joints
@@ -36,6 +37,7 @@ from clothjax.simulation.characters import Character
 from clothjax.training import run_folder
 from clothjax.types import Motion
 
+EVALUATION = "evaluation.json"  # the report in a run's folder
 MEASURED = "measured.json"  # parts of an evaluation that was stopped
 CHARACTERS_FRAMES, CHARACTERS_GAPS = 90, 4  # of the rollout of each character, and where the solver is asked
 PUSHES = {  # accelerations beside gravity, m/s^2, and the frames in which they push
@@ -46,16 +48,18 @@ PUSHES = {  # accelerations beside gravity, m/s^2, and the frames in which they 
 }
 
 
-def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, jobs: int = 1) -> dict:
+def evaluate_packed(
+    folders: dict[str, Path], motions: list[str] | None = None, jobs: int = 1, methods: list[str] | None = None
+) -> dict:
     """Evaluate several models: a report under each name, and under `mean` the means of the methods that all have.
 
     Args:
         folders: of the models, by name.
         motions: asset names or paths; default: those that each model was to be validated on, as far as they are here.
-        jobs: as of `evaluate`.
+        jobs, methods: as of `evaluate`.
 
     Raises:
-        ValueError: if there is no model, or no motion for one.
+        ValueError: if there is no model, or no motion for one; and as `evaluate`.
     """
     if not folders:
         raise ValueError("no garments come with this clothjax; train one with `python -m clothjax train`")
@@ -67,18 +71,22 @@ def evaluate_packed(folders: dict[str, Path], motions: list[str] | None = None, 
             present = assembly.present(wanted)
             absent = set(wanted) - set(present)
             print(f"{name}: on {', '.join(present) or 'no motion'}", *(f"({motion} is not here)" for motion in absent))
-        reports[name] = _evaluated(folder, present, jobs=jobs)
+        reports[name] = _evaluated(folder, present, None, jobs, methods)
     first, *others = (report["evaluation"] for report in reports.values())
-    methods = [method for method in first if all(method in other for other in others)]  # a baseline has others
+    shared = [method for method in first if all(method in other for other in others)]  # a baseline has others
     flat = {name: report.pop("evaluation") | report for name, report in reports.items()}
-    mean = {method: _mean([each[method] for each in flat.values()]) for method in methods}
+    mean = {method: _mean([each[method] for each in flat.values()]) for method in shared}
     for folder in folders.values():  # not before nothing can go wrong any more
         _forget(folder)
     return {"mean": mean} | flat
 
 
 def evaluate(
-    run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None, jobs: int = 1
+    run: Path,
+    motions: list[str] | None = None,
+    settings: EvaluationConfig | None = None,
+    jobs: int = 1,
+    methods: list[str] | None = None,
 ) -> dict:
     """Measure every method of a run: `lbs`, `phi` and `psi`, or `lbs` and a baseline.
 
@@ -89,20 +97,23 @@ def evaluate(
         motions: asset names or paths; default: those of `settings`.
         settings: default: those that the run was trained with.
         jobs: processes that measure at once, each a motion, the long rollout, a wearer or a push.
+        methods: those to measure; of the others, trajectories and measures are those of the last evaluation of the same
+            networks. Default: all.
 
     Raises:
-        ValueError: if there is no motion to measure on, or what was kept is not readable.
+        ValueError: if there is no motion to measure on, or what was kept is not readable; or if some methods are to be
+            measured that there are not, or beside others that were not.
     """
-    report = _evaluated(run, motions, settings, jobs)
+    report = _evaluated(run, motions, settings, jobs, methods)
     _forget(run)
     return report
 
 
 def _evaluated(
-    run: Path, motions: list[str] | None = None, settings: EvaluationConfig | None = None, jobs: int = 1
+    run: Path, motions: list[str] | None, settings: EvaluationConfig | None, jobs: int, methods: list[str] | None
 ) -> dict:
     """Do what `evaluate` does, and keep the parts."""
-    measured = Measured.load(run, settings)
+    measured = Measured.load(run, settings, methods)
     output_folder(run).mkdir(parents=True, exist_ok=True)
     config = measured.experiment.config
     names = list(config.evaluation.motions if motions is None else motions)
@@ -112,9 +123,11 @@ def _evaluated(
         raise ValueError(f"{run}: two motions would have one name in the report: {', '.join(names)}; rename one")
     for name in names:
         assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
+    before = {} if measured.wanted is None else _before(run, names)
     wearers = assembly.wearers(measured.experiment) if config.evaluation.wearers else ()
     frames = len(_start(measured.experiment, names[0]).translation) - 2
-    pushes = [push for push in PUSHES if config.stage2.forces and _pushed_steps(push, frames)]
+    pushable = config.stage2.forces and (methods is None or "psi" in methods)
+    pushes = [push for push in PUSHES if pushable and _pushed_steps(push, frames)]
     in_motion = {name: Part(measure_motion, (name,)) for name in names}
     over_long = Part(measure_long, (names[0],))
     worn = {wearer: Part(measure_wearer, (names[0], wearer)) for wearer in wearers}
@@ -122,8 +135,9 @@ def _evaluated(
     parts = [*in_motion.values(), *worn.values(), over_long, *pushed.values()]  # what takes longest first
     with progress_bar("evaluating", len(parts)) as report:
         kept = Kept(_parts_file(run), _fingerprint(measured))
-        found = measure_all(parts, measured, partial(Measured.load, run, settings), kept, jobs, report)
-    by_motion = {Path(name).stem: found[part] for name, part in in_motion.items()}
+        found = measure_all(parts, measured, partial(Measured.load, run, settings, methods), kept, jobs, report)
+    earlier = [before.get(group, {}) for group in ("motions", "wearers")]
+    by_motion = {Path(name).stem: earlier[0].get(Path(name).stem, {}) | found[part] for name, part in in_motion.items()}
     long = found[over_long]
     return {
         "evaluation": {
@@ -131,8 +145,8 @@ def _evaluated(
             for method in measured.methods
         },
         "motions": by_motion,
-        "wearers": {wearer: found[part] for wearer, part in worn.items()},
-        "pushed": {push: found[part] for push, part in pushed.items()},
+        "wearers": {wearer: earlier[1].get(wearer, {}) | found[part] for wearer, part in worn.items()},
+        "pushed": {push: found[part] for push, part in pushed.items()} or before.get("pushed", {}),
         "betas": assembly.betas(config).tolist(),
         "gap_frames": config.evaluation.gap_frames,
         "garment": config.garment,
@@ -153,15 +167,36 @@ class Measured(NamedTuple):
     methods: dict[str, Method]
     blendshapes: np.ndarray | None  # of Phi, [K, V, 3] m; None where there is no Phi
     fingerprint: int  # of its networks, of `rollouts.fingerprint`
+    wanted: tuple[str, ...] | None = None  # methods to measure; the others were measured before. None: all
 
     @classmethod
-    def load(cls, run: Path, settings: EvaluationConfig | None = None) -> "Measured":
+    def load(cls, run: Path, settings: EvaluationConfig | None = None, methods: list[str] | None = None) -> "Measured":
         """Load what `evaluate` measures; arguments as there."""
         experiment, model = load_run(run, settings, trained.network)
         config = experiment.config
         character = assembly.dress(experiment, assembly.betas(config), configured_material(config))
         shapes = None if config.peer.network else model["params"]["garment"]["blendshapes"]
-        return cls(run, experiment, character, _methods(experiment, model, run), shapes, rollouts.fingerprint(run))
+        known, wanted = _methods(experiment, model, run), None if methods is None else tuple(methods)
+        if wrong := set(wanted or ()).difference(known):
+            raise ValueError(f"{run}: no method {', '.join(sorted(wrong))}; there are {', '.join(known)}")
+        return cls(run, experiment, character, known, shapes, rollouts.fingerprint(run), wanted)
+
+
+def _before(run: Path, motions: list[str]) -> dict:
+    """Return the report of a run or a packed model that was measured before, on all of some motions.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    path, advice = run / (trained.REPORT if trained.packed(run) else EVALUATION), "measure all methods first"
+    try:
+        report = json.loads(path.read_text())
+        lacking = [name for name in motions if Path(name).stem not in report["motions"]]
+    except damage.UNREADABLE as error:
+        raise ValueError(f"{path}: not a report of an evaluation ({error}); {advice}") from error
+    if lacking:
+        raise ValueError(f"{path}: does not have {', '.join(lacking)}; {advice}")
+    return report
 
 
 def _parts_file(run: Path) -> Path:
@@ -176,16 +211,21 @@ def _forget(run: Path) -> None:
 def _fingerprint(measured: Measured) -> int:
     """Return a number that tells evaluations of other models, or with other settings, apart."""
     settings = configuration.to_dict(measured.experiment.config)
-    return run_folder.fingerprint(settings | {"networks": measured.fingerprint})
+    return run_folder.fingerprint(settings | {"networks": measured.fingerprint, "methods": measured.wanted})
 
 
 def measure_motion(measured: Measured, name: str) -> dict[str, dict]:
-    """Measure all methods on one motion, by name, and save their trajectories."""
-    run, experiment, character, methods, shapes, _ = measured
+    """Measure the methods on one motion, by name, and save their trajectories."""
+    run, experiment, character, methods, shapes, _, wanted = measured
     clip = assembly.evaluation_motion(experiment, name)
-    tracks, converged = simulate(experiment, methods, character, clip)
+    if wanted is None:
+        tracks, converged = simulate(experiment, methods, character, clip)
+    else:
+        tracks, converged = Tracks.load(run, name), None
+        anew = {method: methods[method](character, clip)() for method in wanted}
+        tracks = tracks._replace(methods=tracks.methods | anew)
     tracks.save(run, name, measured.fingerprint)
-    return measure(experiment, character, clip, tracks, converged, shapes)
+    return measure(experiment, character, clip, tracks, converged, shapes, wanted)
 
 
 def _methods(experiment: Experiment, model: dict, run: Path) -> dict[str, Method]:
@@ -240,14 +280,16 @@ def measure(
     character: Character,
     clip: Motion,
     tracks: Tracks,
-    converged: float,
+    converged: float | None,
     blendshapes: np.ndarray | None,
+    wanted: Collection[str] | None = None,
 ) -> dict[str, dict]:
     """Measure the methods on one clip, by name, and under `solver` the reference solver.
 
     Args:
-        tracks, converged: of `simulate`.
+        tracks, converged: of `simulate`. Without the latter, the solver is not measured.
         blendshapes: of Phi, [K, V, 3] m; None where there is no Phi.
+        wanted: the methods to measure; default: all.
     """
     scene, settings = experiment.scene, experiment.config.evaluation
     poses, solved = windows(clip), tracks.solver
@@ -257,8 +299,10 @@ def measure(
     roughness = metrics.roughness(solved[late], advance)
     sampled = np.unique(np.linspace(SETTLING_FRAMES, frames - 2, settings.gap_frames).astype(int))
     strain = metrics.edge_strain(scene, character, solved[late])
-    result = {"solver": {"frames": solver_frames, "converged": converged, **strain}}
-    for method, track in tracks.methods.items():
+    solver = {"frames": solver_frames, "converged": converged, **strain}
+    result = {} if converged is None else {"solver": solver}
+    for method in tracks.methods if wanted is None else wanted:
+        track = tracks.methods[method]
         span = blendshapes if method == "phi" else None
         steps = metrics.step_measures(scene, character, jnp.asarray(track), poses, sampled, experiment.config, span)
         measured = metrics.gaps(steps)
@@ -276,7 +320,7 @@ def measure(
 
 def measure_wearer(measured: Measured, name: str, wearer: str) -> dict[str, dict]:
     """Measure the gaps of all methods but skinning on one of nine characters, over the start of a motion."""
-    experiment, methods = measured.experiment, measured.methods
+    experiment, methods, wanted = measured.experiment, measured.methods, measured.wanted
     config, clip = experiment.config, _start(experiment, name)
     poses = windows(clip)
     sampled = np.linspace(SETTLING_FRAMES, len(clip.translation) - 4, CHARACTERS_GAPS).astype(int)
@@ -286,7 +330,7 @@ def measure_wearer(measured: Measured, name: str, wearer: str) -> dict[str, dict
             metrics.step_measures(experiment.scene, character, make(character, clip)(), poses, sampled, config)
         )
         for method, make in methods.items()
-        if method != "lbs"
+        if method != "lbs" and (wanted is None or method in wanted)
     }
 
 

@@ -1,6 +1,7 @@
 """What a report measures beside the validation motions, and what tells evaluations apart."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +111,72 @@ def test_strain_is_compared_at_the_frames_of_the_solver(tmp_path, monkeypatch):
     measured = report.measure(experiment, character, clip, tracks, 1.0, None)["lbs"]
     assert measured["edge_strain_ratio"] == pytest.approx(1.0)
     assert measured["edge_strain_p95"] == pytest.approx(0.54, rel=1e-4)
+
+
+@pytest.fixture
+def psi_alone(tmp_path, monkeypatch):
+    """What is measured of a run that was measured before, of which Psi alone is measured again."""
+    experiment = random_force_psi().experiment
+    settings = dataclasses.replace(experiment.config.evaluation, wearers=True)
+    experiment = experiment._replace(config=dataclasses.replace(experiment.config, evaluation=settings))
+    count = len(assembly.motion(experiment, "walk_3").translation) - 2
+    tracks = {"lbs": np.ones((count, 1, 3)), "phi": np.ones((count, 1, 3)), "psi": np.ones((count, 1, 3))}
+
+    def psi(character, clip):
+        return lambda: np.full((len(clip.translation) - 2, 1, 3), 7.0)
+
+    monkeypatch.setattr(report.Tracks, "load", lambda *_: rollouts.Tracks(tracks, np.ones((20, 1, 3))))
+    monkeypatch.setattr(report.Tracks, "save", lambda *_: None)
+    methods = {"lbs": None, "phi": None, "psi": psi}
+    character = assembly.dress(experiment, jnp.zeros(10), configured_material(experiment.config))
+    measured = report.Measured(tmp_path, experiment, character, methods, None, 0, ("psi",))
+    monkeypatch.setattr(report.Measured, "load", lambda *_: measured)
+    monkeypatch.setattr(metrics, "step_measures", lambda scene, character, track, *_, **__: track)
+    monkeypatch.setattr(metrics, "gaps", lambda track: {"hold_gap": float(np.mean(track))})
+    others = {"penetrations": {}, "beside_solver": {}, "roughness": 1.0, "edge_strain": {"edge_strain_p95": 1.0}}
+    for name, value in others.items():
+        monkeypatch.setattr(metrics, name, lambda *_, value=value: value)
+    monkeypatch.setattr(report.assembly, "wearers", lambda _: {"tall": (None,)})
+    monkeypatch.setattr(report.assembly, "dress", lambda *_: character)
+    monkeypatch.setattr(report, "measure_push", lambda *_: {"hold_gap": 8.0})
+    monkeypatch.setattr(report, "measure_long", lambda *_: {"phi": {"finite": True}, "psi": {"finite": True}})
+    measured_before = {"lbs": {"hold_gap": 1.5}, "phi": {"hold_gap": 0.5}, "psi": {"hold_gap": 3.0, "old": 1.0}}
+    return {
+        "motions": {"walk_3": {"solver": {"converged": 0.9}} | measured_before},
+        "wearers": {"tall": {"phi": {"hold_gap": 0.6}, "psi": {"hold_gap": 4.0}}},
+        "pushed": {"none": {"hold_gap": 5.0}},
+    }
+
+
+def test_some_methods_are_measured_beside_what_was_measured_of_the_others(psi_alone, tmp_path):
+    (tmp_path / report.EVALUATION).write_text(json.dumps(psi_alone))
+    found = report.evaluate(tmp_path, ["walk_3"], methods=["psi"])
+    gaps = {name: measured["hold_gap"] for name, measured in found["evaluation"].items()}
+    assert gaps == {"lbs": 1.5, "phi": 0.5, "psi": 7.0}
+    motion = found["motions"]["walk_3"]
+    assert motion["solver"] == {"converged": 0.9} and "old" not in motion["psi"]
+    assert found["wearers"]["tall"] == {"phi": {"hold_gap": 0.6}, "psi": {"hold_gap": 7.0}}
+    assert set(found["pushed"]) == set(report.PUSHES) and found["pushed"]["none"]["hold_gap"] == 8.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "not a report of an evaluation .*No such file"),
+        ("{", "not a report of an evaluation"),
+        ('{"motions": {"dance_3": {}}}', "does not have walk_3"),
+    ],
+)
+def test_some_methods_are_not_measured_beside_what_was_not(psi_alone, tmp_path, text, message):
+    if text is not None:
+        (tmp_path / report.EVALUATION).write_text(text)
+    with pytest.raises(ValueError, match=rf"evaluation\.json: {message}.*; measure all methods first"):
+        report.evaluate(tmp_path, ["walk_3"], methods=["psi"])
+
+
+def test_a_method_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="tshirt: no method phj; there are lbs, phi, psi"):
+        report.Measured.load(trained.find("tshirt"), methods=["psi", "phj"])
 
 
 def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):

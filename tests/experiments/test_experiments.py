@@ -175,7 +175,7 @@ def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, mon
     monkeypatch.setattr(ship, "evaluate_packed", evaluate_packed)
     monkeypatch.setattr(ship, "table", str)
     ship.main([str(finished), "shirt", "--motions", "walk_3", "--jobs", "2"])
-    assert given == [(["walk_3"], 2)]
+    assert given == [(["walk_3"], 2, None)]
     assert trained.shipped() == ("shirt",) and "commit" not in trained.provenance(tmp_path / "shirt")
     text = (tmp_path / "shirt" / "README.md").read_text()
     worst = max(measured["wearers"], key=lambda name: measured["wearers"][name]["psi"]["hold_gap"])
@@ -184,6 +184,13 @@ def test_a_run_is_shipped_with_its_measures_and_its_card(finished, tmp_path, mon
     report = json.loads((tmp_path / "shirt" / "report.json").read_text())
     assert report["commit"] == ship.commit(storage.ASSETS.parents[1])
     assert f"{len(assembly.training_motions(trained.phi(finished)[0]))} motions, 0 of them from files" in text
+    report["commit"] = "of before"  # then Psi is measured again
+    (tmp_path / "shirt" / "report.json").write_text(json.dumps(report))
+    ship.main(["shirt", "shirt", "--methods", "psi"])
+    report = json.loads((tmp_path / "shirt" / "report.json").read_text())
+    assert given[1] == (None, 1, ["psi"]) and report["commit"] != "of before"
+    assert report["commits"] == {"lbs": "of before", "phi": "of before"}
+    assert "(skinning at of before, Phi at of before)" in (tmp_path / "shirt" / "README.md").read_text()
     report["psi"]["step_error_mm"] = 777.0
     del report["hours"], report["seed"], report["command"], report["commit"]
     for gap in (0.8, 1.2):
