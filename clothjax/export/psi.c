@@ -1391,7 +1391,8 @@ static void push_shown(const psi_model *m, psi_state *s) {
     }
 }
 
-/* Relaxes vertices [vertices][3], then pushes them out of the body and relaxes them in turn: drape._relaxed_outside. */
+/* Relaxes vertices [vertices][3], then pushes them out of the body and relaxes them in turn, with the planes that are
+   nearest as each round begins: drape._relaxed_outside. */
 static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
     const float *last = s->translation + 3;
     const size_t rows = padded(m->vertices);
@@ -1399,7 +1400,7 @@ static void lift_shown(const psi_model *m, psi_state *s, float *vertices) {
         for (int c = 0; c < 3; c++) s->shown[c * rows + v] = vertices[3 * v + c] - last[c];
     ease_all(&m->f.shown, s->shown, s->eased, s->moved);
     const float nowhere[3] = {0};
-    for (int32_t round = 0; round < m->f.rounds; round++) {
+    for (int32_t k = 0; k < m->f.rounds; k++) {
         find_planes_shown(m, s);
         raise_planes_shown(m, s);
         for (size_t v = 0; v < rows; v++) s->aim[v] = m->f.offset;
