@@ -38,8 +38,9 @@ Gaps are taken at `evaluation.gap_frames` frames, spread over each motion; penet
 forces, pushed by accelerations of `PUSHES`, stand under `pushed`. Both are of at most 90 frames; a push that a shorter
 motion does not reach is left out.
 
-`--methods` measures some of them, such as a Psi that is loaded in another way now. The solver and the other methods
-are then not run again: their trajectories and measures are those of the last evaluation of the same networks.
+`--methods` measures some of them, such as a Psi that is shown in another way now. The solver and the other methods are
+then run on no motion again: their trajectories and measures are those of the last evaluation of the same networks. The
+long rollout is of all.
 
 The report of one folder is written into it, as `evaluation.json`. For names, or several folders, it has the means over
 garments under `mean` and the report of each under its name. Validation motions that are not present are then left out:
