@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from clothjax.config import EvaluationConfig
+from clothjax.config import Config, EvaluationConfig
 from clothjax.evaluation import metrics, rollouts
 from clothjax.evaluation.parts import Kept, Part, measure_all
 from clothjax.evaluation.rollouts import (
@@ -123,7 +123,7 @@ def _evaluated(
         raise ValueError(f"{run}: two motions would have one name in the report: {', '.join(names)}; rename one")
     for name in names:
         assembly.evaluation_motion(measured.experiment, name)  # a wrong one shows now, not after an hour
-    before = {} if measured.wanted is None else _before(run, names)
+    before = {} if measured.wanted is None else _before(run, names, config)
     wearers = assembly.wearers(measured.experiment) if config.evaluation.wearers else ()
     frames = len(_start(measured.experiment, names[0]).translation) - 2
     pushable = config.stage2.forces and (methods is None or "psi" in methods)
@@ -182,8 +182,11 @@ class Measured(NamedTuple):
         return cls(run, experiment, character, known, shapes, rollouts.fingerprint(run), wanted)
 
 
-def _before(run: Path, motions: list[str]) -> dict:
+def _before(run: Path, motions: list[str], config: Config) -> dict:
     """Return the report of a run or a packed model that was measured before, on all of some motions.
+
+    Args:
+        config: with the settings of now, which must be those of then.
 
     Raises:
         ValueError: if there is none.
@@ -192,10 +195,14 @@ def _before(run: Path, motions: list[str]) -> dict:
     try:
         report = json.loads(path.read_text())
         lacking = [name for name in motions if Path(name).stem not in report["motions"]]
+        same = report["gap_frames"] == config.evaluation.gap_frames
+        same = same and np.allclose(report["betas"], assembly.betas(config), atol=1e-6)
     except damage.UNREADABLE as error:
         raise ValueError(f"{path}: not a report of an evaluation ({error}); {advice}") from error
     if lacking:
         raise ValueError(f"{path}: does not have {', '.join(lacking)}; {advice}")
+    if not same:
+        raise ValueError(f"{path}: of other gap_frames or betas; {advice}")
     return report
 
 

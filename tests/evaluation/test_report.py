@@ -145,6 +145,8 @@ def psi_alone(tmp_path, monkeypatch):
         "motions": {"walk_3": {"solver": {"converged": 0.9}} | measured_before},
         "wearers": {"tall": {"phi": {"hold_gap": 0.6}, "psi": {"hold_gap": 4.0}}},
         "pushed": {"none": {"hold_gap": 5.0}},
+        "betas": np.asarray(assembly.betas(experiment.config)).tolist(),
+        "gap_frames": experiment.config.evaluation.gap_frames,
     }
 
 
@@ -164,12 +166,16 @@ def test_some_methods_are_measured_beside_what_was_measured_of_the_others(psi_al
     [
         (None, "not a report of an evaluation .*No such file"),
         ("{", "not a report of an evaluation"),
-        ('{"motions": {"dance_3": {}}}', "does not have walk_3"),
+        ({"motions": {"dance_3": {}}}, "does not have walk_3"),
+        ({"gap_frames": 777}, "of other gap_frames or betas"),
+        ({"betas": [9.0] * 10}, "of other gap_frames or betas"),
     ],
 )
 def test_some_methods_are_not_measured_beside_what_was_not(psi_alone, tmp_path, text, message):
+    """Nor beside what was measured with other settings."""
     if text is not None:
-        (tmp_path / report.EVALUATION).write_text(text)
+        changed = text if isinstance(text, str) else json.dumps(psi_alone | text)
+        (tmp_path / report.EVALUATION).write_text(changed)
     with pytest.raises(ValueError, match=rf"evaluation\.json: {message}.*; measure all methods first"):
         report.evaluate(tmp_path, ["walk_3"], methods=["psi"])
 
