@@ -300,15 +300,15 @@ def test_the_report_of_several_garments(tmp_path, monkeypatch):
         path.parent.mkdir()
         path.write_text("{}")
 
-    def measured(folder, motions, jobs):
-        assert motions == ["walk_3"] and jobs == 2 and all(path.exists() for path in kept)
+    def measured(folder, motions, settings, jobs, methods):
+        assert motions == ["walk_3"] and jobs == 2 and methods == ["psi"] and all(path.exists() for path in kept)
         gap, most, finite = figures[folder.name]
         found = {"energy_gap": gap, "penetration_max_mm": most, "finite": finite, "where": {}}
         found |= {"penetration_percent": 0.0} if folder.name == "skirt" else {}  # of the other there is no body
         return {"evaluation": dict.fromkeys(("lbs", "phi", "psi"), found), "motions": {}}
 
     monkeypatch.setattr(measures, "_evaluated", measured)
-    report = measures.evaluate_packed({name: tmp_path / name for name in figures}, jobs=2)
+    report = measures.evaluate_packed({name: tmp_path / name for name in figures}, None, 2, ["psi"])
     assert report["mean"]["psi"] == {"energy_gap": 0.2, "penetration_max_mm": 2.0, "finite": False}
     assert report["dress"]["phi"]["energy_gap"] == 0.3 and report["skirt"]["motions"] == {}
     assert not any(path.exists() for path in kept)
