@@ -5,8 +5,8 @@
 It writes `clothjax/assets/models/skirt/`: model.npz, config.yaml, report.json and the card, README.md. The report has
 the measures of the packed model on the validation motions, the command that trained it and its hours. A folder from
 `experiments.tune` is already packed. Any other garment of that name is replaced. Of a garment of the library, given by
-its name alone, only report and card are written again. With `--methods psi` that is of Psi alone, in a quarter of the
-time: what `commit` does not hold for is then in `commits`.
+its name alone, only report and card are written again. With `--methods psi` that is of Psi alone; `commits` then
+tells what the other methods are of.
 """
 
 import json
@@ -49,7 +49,7 @@ def main(argv: list[str]) -> None:
     report = reports[arguments.name]
     if arguments.methods is not None:
         before = json.loads((packed / trained.REPORT).read_text())
-        kept = [method for method in ("lbs", "phi", "psi") if method in report and method not in arguments.methods]
+        kept = [method for method in model_card.METHODS if method in report and method not in arguments.methods]
         about["commits"] = {
             method: before.get("commits", {}).get(method, before.get("commit", "unknown")) for method in kept
         }

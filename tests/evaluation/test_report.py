@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from samples import random_force_psi
 
+from clothjax.commands import evaluate as command
 from clothjax.evaluation import metrics, report, rollouts
 from clothjax.material import configured_material
 from clothjax.runtime import loading, trained
@@ -150,7 +151,13 @@ def psi_alone(tmp_path, monkeypatch):
     }
 
 
-def test_some_methods_are_measured_beside_what_was_measured_of_the_others(psi_alone, tmp_path):
+def test_some_methods_are_measured_beside_what_was_measured_of_the_others(psi_alone, tmp_path, monkeypatch):
+    """Also by processes that load for themselves what they measure."""
+    measured, loads = report.Measured.load(), []
+    monkeypatch.setattr(report.Measured, "load", lambda *given: loads.append(given) or measured)
+    monkeypatch.setattr(
+        report, "measure_all", lambda parts, _, load, *__: {part: part.measure(load(), *part.about) for part in parts}
+    )
     (tmp_path / report.EVALUATION).write_text(json.dumps(psi_alone))
     found = report.evaluate(tmp_path, ["walk_3"], methods=["psi"])
     gaps = {name: measured["hold_gap"] for name, measured in found["evaluation"].items()}
@@ -159,6 +166,34 @@ def test_some_methods_are_measured_beside_what_was_measured_of_the_others(psi_al
     assert motion["solver"] == {"converged": 0.9} and "old" not in motion["psi"]
     assert found["wearers"]["tall"] == {"phi": {"hold_gap": 0.6}, "psi": {"hold_gap": 7.0}}
     assert set(found["pushed"]) == set(report.PUSHES) and found["pushed"]["none"]["hold_gap"] == 8.0
+    assert len(loads) > 5 and all(given == (tmp_path, None, ["psi"]) for given in loads)
+
+
+def test_pushes_are_of_before_where_psi_is(psi_alone, tmp_path, monkeypatch):
+    measured = report.Measured.load()
+    methods = measured.methods | {"phi": measured.methods["psi"], "psi": None}
+    phi_alone = measured._replace(methods=methods, wanted=("phi",))
+    monkeypatch.setattr(report.Measured, "load", lambda *_: phi_alone)
+    (tmp_path / report.EVALUATION).write_text(json.dumps(psi_alone))
+    found = report.evaluate(tmp_path, ["walk_3"], methods=["phi"])
+    gaps = {name: measured["hold_gap"] for name, measured in found["evaluation"].items()}
+    assert gaps == {"lbs": 1.5, "phi": 7.0, "psi": 3.0} and found["pushed"] == psi_alone["pushed"]
+    assert found["wearers"]["tall"] == {"phi": {"hold_gap": 7.0}, "psi": {"hold_gap": 4.0}}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_the_command_says_which_methods(tmp_path, monkeypatch, packed):
+    given = []
+    for name in ("evaluate", "evaluate_packed"):
+        monkeypatch.setattr(
+            command,
+            name,
+            lambda *a, name=name, **k: given.append((name, a, k)) or {"mean": {}, "evaluation": {}},
+        )
+    model = "skirt" if packed else str(trained.find("skirt"))
+    command.main([model, "--methods", "psi", "lbs", "--json", str(tmp_path / "r.json")])
+    (name, arguments, others), methods = given[0], ["psi", "lbs"]
+    assert name == ("evaluate_packed" if packed else "evaluate") and methods in (*arguments, others.get("methods"))
 
 
 @pytest.mark.parametrize(
@@ -183,6 +218,11 @@ def test_some_methods_are_not_measured_beside_what_was_not(psi_alone, tmp_path, 
 def test_a_method_that_is_not_there_is_refused():
     with pytest.raises(ValueError, match="tshirt: no method phj; there are lbs, phi, psi"):
         report.Measured.load(trained.find("tshirt"), methods=["psi", "phj"])
+
+
+def test_a_garment_of_the_library_has_its_report_of_before():
+    folder = trained.find("skirt")
+    assert set(report._before(folder, ["walk_3"], trained.configured(folder))) > {"motions", "pushed", "wearers"}
 
 
 def test_two_motions_of_one_name_are_refused(tmp_path, monkeypatch):
@@ -211,15 +251,16 @@ def test_what_was_measured_is_of_one_model_and_its_settings(tmp_path, monkeypatc
     monkeypatch.setattr(trained, "network", lambda _: (forced.experiment.config, models["network"]))
     monkeypatch.setattr(trained, "psi", lambda _: trained.TrainedPsi(None, {}, models["predictor"], ()))
 
-    def number(experiment=forced.experiment):
+    def number(experiment=forced.experiment, wanted=None):
         return report._fingerprint(
-            report.Measured(tmp_path, experiment, None, {}, None, rollouts.fingerprint(tmp_path))
+            report.Measured(tmp_path, experiment, None, {}, None, rollouts.fingerprint(tmp_path), wanted)
         )
 
     first, config = number(), forced.experiment.config
     settings = dataclasses.replace(config.evaluation, gap_frames=config.evaluation.gap_frames + 1)
     other = dataclasses.replace(config, evaluation=settings)
     assert number() == first != number(forced.experiment._replace(config=other))
+    assert number(wanted=("psi",)) not in (first, number(wanted=("phi",)))
     for part in ("network", "predictor"):
         before, models[part] = models[part], {"w": np.zeros(3)}
         assert number() != first
